@@ -20,10 +20,10 @@ from calib.commands.plan import PlanArena
 from calib.commands.undo import Redo, Undo
 from calib.commands.wand import Wand
 from calib.commands.world import World
-from camera_node.command_line import parse
-from camera_node.errors import check_command
-from camera_node.logs import set_up_logging
-from camera_node.processes.program import run
+from camera_node.foundation.command_line import parse
+from camera_node.foundation.errors import check_command
+from camera_node.foundation.logs import set_up_logging
+from camera_node.foundation.program import run
 
 Command = (
     Annotated[Intrinsics, tyro.conf.subcommand("intrinsics")]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The exceptions of calibration."""
 
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 
 
 class CalibrationError(RoundelError):

@@ -4,11 +4,11 @@
 
 import sys
 
-from camera_node.command_line import run_command
 from camera_node.commands.publish import Publish
-from camera_node.errors import check_command
-from camera_node.logs import set_up_logging
-from camera_node.processes.program import run
+from camera_node.foundation.command_line import run_command
+from camera_node.foundation.errors import check_command
+from camera_node.foundation.logs import set_up_logging
+from camera_node.foundation.program import run
 
 
 def main() -> None:

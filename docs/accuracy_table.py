@@ -15,7 +15,7 @@ import msgspec
 from calib.plan.camera_kind import PlannedCamera
 from calib.plan.description import Plan
 from calib.plan.planner import PlannedArena, evaluate
-from camera_node.config import load_yaml
+from camera_node.foundation.config import load_yaml
 
 replace = msgspec.structs.replace
 Change = Callable[[Plan], Plan]

@@ -13,7 +13,7 @@ import numpy as np
 from calib.plan.camera_kind import CameraKind, PlannedCamera
 from calib.plan.description import Plan
 from calib.plan.planner import PlannedArena, PlanReport, evaluate
-from camera_node.config import load_yaml
+from camera_node.foundation.config import load_yaml
 
 KINDS = {
     "webcam, 1080p, 30 Hz": CameraKind(width=1920, height=1080, fov_deg=75.0, fps=30.0, shutter="rolling"),

@@ -6,11 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import draw_refused, draw_roundels
 from camera_node.detection.refusals import RefusedRing, explain
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.simulation.sensor import MILD
 from tests.benchmarks.detector.pictures import Card, flat, paste
 

@@ -11,7 +11,7 @@ from calib.plan.description import Plan, PlannedRobots, Requirement
 from calib.plan.figures import draw_coverage, draw_distribution, draw_errors
 from calib.plan.placement import PlacementProblem, suggest_placement
 from calib.plan.planner import PlannedArena, evaluate
-from camera_node.terminal import progress_bar
+from camera_node.foundation.terminal import progress_bar
 
 KIND = CameraKind(model="ov9281")
 PLAN = Plan(

@@ -7,7 +7,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from camera_node.config import example_file
+from camera_node.foundation.config import example_file
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import Scene
 

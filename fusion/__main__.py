@@ -9,10 +9,10 @@ from typing import Any
 # Before NumPy is loaded: threads of a BLAS wait for each other longer than the products of small matrices take.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from camera_node.command_line import run_command
-from camera_node.errors import check_command
-from camera_node.logs import set_up_logging
-from camera_node.processes.program import run
+from camera_node.foundation.command_line import run_command
+from camera_node.foundation.errors import check_command
+from camera_node.foundation.logs import set_up_logging
+from camera_node.foundation.program import run
 from fusion.commands.serve import Serve
 
 COMMANDS = {  # and their modules in fusion.commands

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The errors of fusion."""
 
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 
 
 class FusionError(RoundelError):

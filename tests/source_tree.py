@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The modules of the programs and their imports, as `tests/test_architecture.py` and the structure benchmark read them."""
+"""Modules of the programs and their imports, for `tests/test_architecture.py` and the benchmark of the structure."""
 
 import ast
 import itertools

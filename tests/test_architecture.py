@@ -17,7 +17,7 @@ from tests.conftest import ROOT
 PROGRAMS = ("camera_node", "calib", "fusion", "web")
 MAX_PARAMETERS = 6
 MAX_MODULES = 14  # of one folder
-COMMON_TYPES = {"Array", "Index", "Mask", "Grey"}  # camera_node/arrays.py defines them
+COMMON_TYPES = {"Array", "Index", "Mask", "Grey"}  # camera_node/foundation/arrays.py defines them
 
 # Commands of the command line: tyro turns each parameter into an option, so a function may have more of them.
 COMMANDS = {"define", "record", "ros2", "run"}
@@ -139,14 +139,14 @@ def test_folders_have_at_most_fourteen_modules():
 
 
 def test_array_types_are_defined_once():
-    """In camera_node/arrays.py, which is also the only module that writes NDArray[np.float64]."""
+    """In camera_node/foundation/arrays.py, which is also the only module that writes NDArray[np.float64]."""
     for path in sources(*PROGRAMS, "tests"):
         nodes = list(ast.walk(parse(path)))
         targets = [t for node in nodes if isinstance(node, ast.Assign) for t in node.targets]
         names = {target.id for target in targets if isinstance(target, ast.Name)}
         spelled = any(isinstance(n, ast.Subscript) and ast.unparse(n) == "NDArray[np.float64]" for n in nodes)
         defines = bool(names & COMMON_TYPES) or spelled
-        assert defines == (name_of(path) == "camera_node/arrays.py"), name_of(path)
+        assert defines == (name_of(path) == "camera_node/foundation/arrays.py"), name_of(path)
 
 
 @pytest.mark.parametrize("extra", ["gtsam", "viser", "scipy"])

@@ -22,7 +22,7 @@ import camera_node._core, camera_node.node.node, calib.rig.rig, fusion._core, fu
 here = pathlib.Path(sys.argv[1])
 for module in (camera_node, camera_node._core, calib, fusion, fusion._core):
     assert here in pathlib.Path(module.__file__).parents, module.__file__
-from camera_node.config import example_file
+from camera_node.foundation.config import example_file
 assert here in example_file("demo/scene.yaml").parents
 """
 

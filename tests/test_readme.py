@@ -15,7 +15,7 @@ import cv2
 import psutil
 import pytest
 
-from camera_node.errors import TEMPORARY_FAILURE
+from camera_node.foundation.errors import TEMPORARY_FAILURE
 from tests.calib.boards import SPEC, board_poses, render
 from tests.conftest import ROOT, free_port
 from tests.waiting import wait_for_port

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR
+from camera_node.foundation.errors import TEMPORARY_FAILURE, USER_ERROR
 from tests.conftest import ROOT, free_port
 from tests.fusion.serving import config, serving
 from tests.seccomp import HEADER

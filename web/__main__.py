@@ -14,12 +14,12 @@ from pathlib import Path
 # Before NumPy is loaded, as in fusion.__main__: the page calibrates cameras.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from camera_node.command_line import parse
-from camera_node.config import example_file
-from camera_node.logs import set_up_logging
-from camera_node.processes.program import run
+from camera_node.foundation.command_line import parse
+from camera_node.foundation.config import example_file
+from camera_node.foundation.logs import set_up_logging
+from camera_node.foundation.program import run
+from camera_node.foundation.service import stopped_by_signals
 from camera_node.protocol.connection import ServerConnection
-from camera_node.service import stopped_by_signals
 from web.state.feed import Feed
 from web.state.replay import RecordingPlayer
 from web.state.subscription import Subscription

@@ -13,8 +13,8 @@ zenoh.json5    how the server is found in the network
 from dataclasses import dataclass
 from pathlib import Path
 
-from camera_node.config import example_file, require_name, write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import example_file, require_name, write_atomically
+from camera_node.foundation.errors import ConfigError
 
 ARENA = """\
 # Written by `roundel up`; edit it freely. configs/arena.yaml of the package describes all settings.

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from camera_node.commands.camera import LocalCameras, given_options
-from camera_node.errors import NetworkError
-from camera_node.processes.supervisor import Supervisor
+from camera_node.foundation.errors import NetworkError
+from camera_node.foundation.supervisor import Supervisor
 from camera_node.sources.frame import SourceSettings
 from fusion.server.config import ArenaConfig
 from web.arena_folder import ArenaFolder

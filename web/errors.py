@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The exception of the viewer and the demo."""
 
-from camera_node.errors import TEMPORARY_FAILURE, RoundelError
+from camera_node.foundation.errors import TEMPORARY_FAILURE, RoundelError
 
 
 class WebError(RoundelError):

@@ -10,7 +10,7 @@ from typing import Protocol
 import viser
 
 from calib.rig.rig import Rig
-from camera_node.service import ServiceManager
+from camera_node.foundation.service import ServiceManager
 from web.errors import PortError, WebError
 from web.html_tables import READ_ONLY_STYLE
 from web.page_access import PageAccess, current_role, guarding

@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 from web.html_tables import small
 
 log = logging.getLogger("web")

@@ -19,9 +19,9 @@ from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibra
 from calib.wand.quality.assessment import assess
 from calib.wand.result import WandCalibration
 from calib.wand.scale import Distance
+from camera_node.foundation.terminal import progress_console, say
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
-from camera_node.terminal import progress_console, say
 
 
 @dataclass(frozen=True, kw_only=True)

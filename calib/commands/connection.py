@@ -11,11 +11,11 @@ from zenoh import Session
 
 from calib.live.rig_requests import set_rig
 from calib.rig.rig import Rig
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
+from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestError
 from camera_node.protocol.server_address import LOCAL, ServerAddress
 from camera_node.protocol.session import open_client
-from camera_node.terminal import say
 
 
 @dataclass(frozen=True, kw_only=True)

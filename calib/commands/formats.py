@@ -13,8 +13,8 @@ from calib.formats.data import PixelOrigin, PointTable
 from calib.formats.registry import FORMATS, Format
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
-from camera_node.errors import ConfigError
-from camera_node.terminal import say
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 
 FormatName = Literal[
     "argus", "easywand", "dltdv", "multicamselfcal", "caliscope", "opencv", "kalibr", "colmap"

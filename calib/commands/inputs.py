@@ -13,8 +13,8 @@ from calib.errors import CalibrationError
 from calib.rig.recording import read_detections
 from calib.rig.rig import Rig
 from calib.wand.scale import SIGMA_M, Distance
-from camera_node.config import example_file
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import example_file
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import detect_frames, read_observations

@@ -18,8 +18,8 @@ from calib.intrinsics.guided_capture import capture_views, make_panel
 from calib.intrinsics.images import find_cameras, read_frames, take_snapshots
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.rig import load_rig
-from camera_node.errors import ConfigError
-from camera_node.terminal import progress_console, say, track
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import progress_console, say, track
 
 
 @dataclass(frozen=True, kw_only=True)

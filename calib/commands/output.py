@@ -17,8 +17,8 @@ from calib.rig.precision_plot import draw_precision
 from calib.rig.rig import Rig, save_rig
 from calib.wand.quality.grade import RigQuality
 from calib.wand.result import WandCalibration
-from camera_node.errors import ConfigError
-from camera_node.terminal import say
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 
 
 def check_folder(out: Path) -> None:

@@ -19,9 +19,9 @@ from calib.plan.report import check_report, write_report
 from calib.plan.summary import describe, summarize
 from calib.rig.camera import Camera
 from calib.rig.rig import load_rig
-from camera_node.config import dump_yaml, load_yaml, write_atomically
-from camera_node.errors import ConfigError
-from camera_node.terminal import progress_bar, say
+from camera_node.foundation.config import dump_yaml, load_yaml, write_atomically
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import progress_bar, say
 
 
 @dataclass(frozen=True, kw_only=True)

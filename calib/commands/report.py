@@ -13,7 +13,7 @@ from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
 from calib.wand.recalibration import Recalibration
 from calib.wand.report import WandReport
 from calib.wand.result import WandCalibration
-from camera_node.terminal import console, say
+from camera_node.foundation.terminal import console, say
 
 MIN_INFLATION = 1.2  # of standard deviations, that is printed
 CLEAR = 3.0  # standard deviations, from which a clock drift is printed

@@ -7,7 +7,7 @@ from pathlib import Path
 from calib.commands.connection import Connection, Server
 from calib.rig.history import History, HistoryStep
 from calib.rig.rig import Rig, load_rig
-from camera_node.terminal import say
+from camera_node.foundation.terminal import say
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,11 +29,11 @@ from calib.wand.calibrate import calibrate
 from calib.wand.quality.assessment import assess
 from calib.wand.recalibration import recalibrate_camera
 from calib.wand.scale import Distance
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import console, progress_console, say
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import read_observations
-from camera_node.terminal import console, progress_console, say
 
 PROGRAM = "calib wand"
 

@@ -20,12 +20,12 @@ from calib.world.resection import place_by_points
 from calib.world.still_roundels import find_still_roundels
 from calib.world.survey import read_positions
 from calib.world.world_frame import align_cameras, check_above, is_collinear
-from camera_node.arrays import Array
-from camera_node.config import load_yaml
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import load_yaml
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
-from camera_node.terminal import say
 
 UPSIDE_DOWN = 0.3  # mean upward component of the images' downward axes, above which cameras are upside down
 Landmarks = Mapping[str, Array]

@@ -21,9 +21,9 @@ from calib.errors import CalibrationError
 from calib.formats.data import ForeignData, PixelOrigin, PointTable, make_camera, read_numbers, read_text
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.arrays import Array, Index
-from camera_node.config import write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import invert
 
 DLTDV8, ARGUS = PixelOrigin(1), PixelOrigin(1, y_up=True)

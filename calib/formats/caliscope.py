@@ -20,8 +20,8 @@ from calib.errors import CalibrationError
 from calib.formats.data import ForeignData, PixelOrigin, PointTable, make_camera, read_text
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.config import write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector, vector_from_rotation
 
 COLUMNS = ("sync_index", "point_id", "img_loc_x", "img_loc_y")

@@ -10,7 +10,7 @@ from calib.errors import CalibrationError
 from calib.formats.data import PixelOrigin
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.config import write_atomically
+from camera_node.foundation.config import write_atomically
 from camera_node.geometry.pose import invert, wxyz_from_rotation
 
 FROM_ZERO = PixelOrigin(0)

@@ -13,9 +13,9 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
-from camera_node.arrays import Array, Index
-from camera_node.config import write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import ConfigError
 
 MAX_FILE_BYTES = 1 << 28  # of a table of points: an hour of 16 cameras at 60 Hz takes a fifth of it
 

@@ -18,11 +18,11 @@ from calib.formats.data import ForeignData, PixelOrigin, make_camera
 from calib.formats.lens_models import with_coefficients
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.arrays import Array
-from camera_node.config import write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.yaml_file import read_yaml
 from camera_node.geometry.pose import Pose, invert
-from camera_node.yaml_file import read_yaml
 
 FROM_ZERO = PixelOrigin(0)
 MODELS = {"radtan": "pinhole", "equidistant": "fisheye", "none": "pinhole"}

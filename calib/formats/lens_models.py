@@ -4,7 +4,7 @@
 import numpy as np
 
 from calib.errors import CalibrationError
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
 GRID = 25  # points across and down the image

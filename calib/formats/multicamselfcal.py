@@ -19,9 +19,9 @@ from calib.formats.data import ForeignData, PixelOrigin, PointTable, make_camera
 from calib.formats.lens_models import with_coefficients
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.arrays import Array
-from camera_node.config import require_name, write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import require_name, write_atomically
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import Pose, invert
 
 FROM_ZERO = PixelOrigin(0)

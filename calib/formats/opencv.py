@@ -17,10 +17,10 @@ from calib.errors import CalibrationError
 from calib.formats.data import ForeignData, PixelOrigin, make_camera
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.config import is_name, write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import is_name, write_atomically
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.yaml_file import read_yaml
 from camera_node.geometry.pose import invert
-from camera_node.yaml_file import read_yaml
 
 FROM_ZERO = PixelOrigin(0)
 MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M", "M1", "intrinsic_matrix")

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Grey
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.errors import ConfigError
 
 Corners = tuple[NDArray[np.float32], NDArray[np.float32]]
 

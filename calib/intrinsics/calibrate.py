@@ -22,7 +22,7 @@ from calib.intrinsics.calibrated_lens import CalibratedLens, aspect_ratio, proje
 from calib.rig.camera import Camera, stated_sigma
 from calib.rig.coverage import Coverage, enumerate_words
 from calib.rig.rig import Rig
-from camera_node.arrays import Array, Grey
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
 
 Model = Literal["pinhole", "fisheye"]

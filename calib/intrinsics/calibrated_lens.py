@@ -9,7 +9,7 @@ import numpy as np
 from calib.intrinsics.adjustment import AdjustedLens, BoardView
 from calib.rig.camera import Camera
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_of
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 BIG_RESIDUAL_PX = 1.0
 CLEARLY_NOT_SQUARE = 0.005  # of fx / fy from 1: lenses of good cameras differ by less

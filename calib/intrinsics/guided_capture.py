@@ -15,7 +15,7 @@ from calib.intrinsics.calibrate import MIN_VIEWS, BoardViews, Model
 from calib.intrinsics.calibrated_lens import CalibratedLens
 from calib.intrinsics.images import NamedImage
 from calib.rig.coverage import Coverage, enumerate_words
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 MIN_CHANGE = 0.04  # of the image's width, by which a view must differ from each earlier one
 TRIAL_EVERY = 5  # views

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import zenoh
 
-from camera_node.arrays import Grey
-from camera_node.errors import CameraError
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.errors import CameraError
 from camera_node.protocol.messages import Keys
 from camera_node.sources.grey import to_grey
 from camera_node.sources.replay import IMAGES, read_grey

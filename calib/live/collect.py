@@ -14,10 +14,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from calib.errors import CalibrationError
 from calib.rig.coverage import Coverage
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.terminal import progress_console
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from camera_node.protocol.publishers import Publishers
-from camera_node.terminal import progress_console
 
 INSPECT_EVERY_S = 0.2
 SILENT_S = 2.0  # without a frame: the camera counts as silent

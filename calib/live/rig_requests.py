@@ -16,7 +16,7 @@ from calib.rig.messages import (
     undo_rig_key,
 )
 from calib.rig.rig import Rig
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.requests import (
     ANSWER_S,

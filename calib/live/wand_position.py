@@ -12,7 +12,7 @@ from calib.rig.triangulation import triangulate_point
 from calib.wand.detections import WandDetections, gather
 from calib.wand.labeling.labels import label
 from calib.wand.timing import MAX_SPREAD_S, Timing
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 

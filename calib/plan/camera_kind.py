@@ -8,8 +8,8 @@ import numpy as np
 
 from calib.plan.catalogue import find_camera
 from calib.rig.camera import Camera
-from camera_node.arrays import Array
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import Pose, look_at
 
 Vector = tuple[float, float, float]

@@ -8,7 +8,7 @@ binned mode has a multiple of the sensor's pixel pitch.
 from dataclasses import dataclass
 from typing import Literal
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 RPI = "Raspberry Pi documentation, Camera hardware: table of camera modules"
 LUXONIS = "Luxonis documentation, Camera sensors"

@@ -7,7 +7,7 @@ import numpy as np
 from calib.plan.camera_kind import CameraKind, PlannedCamera, Vector
 from calib.plan.volume import Volume
 from calib.rig.precision_map import SIGMA_PX
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.sensor_model.imaging import Ground, Imaging
 

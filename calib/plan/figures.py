@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from calib.plan.planner import PlanReport
-from camera_node.arrays import Array
-from camera_node.extras import require
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.extras import require
 
 LEVELS = 3  # maps, from the lowest to the highest level
 ARROW_M = 0.6

@@ -17,7 +17,7 @@ from calib.plan.description import Mount, Plan
 from calib.plan.precision import Uncertainty, view_information
 from calib.plan.views import RoundelSensor
 from calib.rig.camera import Camera
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 BLIND_M = 0.05  # standard deviation of a position along an axis before any view
 COARSE_POINTS, FINE_POINTS = 250, 700  # of the volume: for the exchange, and for Powell's method

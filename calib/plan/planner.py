@@ -16,7 +16,7 @@ from calib.plan.precision import ExpectedErrors, Uncertainty, combine_views, exp
 from calib.plan.views import RoundelSensor
 from calib.plan.volume import Region, Volume, find_regions
 from calib.rig.camera import Camera
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.sensor_model.operational_space import OperationalSpace, operational_space
 from camera_node.sensor_model.threshold import threshold_D
 

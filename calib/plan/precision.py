@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.plan.views import RoundelSensor
 from calib.rig.camera import Camera, pixel_jacobians, transform
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.pose import invert, skew
 
 FLOOR_PX = 0.05  # `sigma_floor_px` of fusion's limits; a test compares them

@@ -11,9 +11,9 @@ from typing import Any
 from calib.plan.figures import draw_coverage, draw_distribution, draw_errors
 from calib.plan.planner import PlanReport
 from calib.plan.summary import PlanSummary, describe, summarize
-from camera_node.config import write_atomically
-from camera_node.errors import ConfigError
-from camera_node.extras import require
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.extras import require
 
 SUFFIXES = (".html", ".pdf")
 PAGE_INCH = (8.27, 11.69)

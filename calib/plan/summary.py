@@ -9,7 +9,7 @@ import numpy as np
 from calib.plan.network import BUSY
 from calib.plan.planner import CameraReach, PlanReport
 from calib.rig.precision_map import format_mm
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 COLUMNS = 13  # of a map as text, at most
 BLIND_LINES = 5

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from calib.plan.camera_kind import CameraKind
 from calib.plan.description import Plan
 from calib.rig.camera import Camera, transform
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 from camera_node.sensor_model.imaging import Imaging

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 
 STEPS = (
     0.05,

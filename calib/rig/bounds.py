@@ -7,7 +7,7 @@ from datetime import date
 from typing import Any
 
 from calib.rig.camera import Camera
-from camera_node.config import NAME_RULE, is_name
+from camera_node.foundation.config import NAME_RULE, is_name
 from camera_node.protocol.messages import MAX_READOUT_US
 
 MAX_CAMERAS = 256

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import Pose, invert, skew
 

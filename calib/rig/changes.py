@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, dump_rig
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.requests import RequestSource
 

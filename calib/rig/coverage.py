@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 
 CELLS = (6, 8)  # rows and columns of the grid
 REGIONS = (

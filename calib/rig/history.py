@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.errors import CalibrationError
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 MAX_OLD = 20  # versions that are kept
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from calib.rig.camera import Camera
 from calib.rig.triangulation import JointCovariance, Visibility, in_image, point_covariances
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 
 SIGMA_PX = 0.1  # of one coordinate of a roundel's centre, as the detector achieves on real images
 COLUMNS = 8  # of a map, about

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
 from calib.rig.precision_map import PrecisionMap, format_mm
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 CELL = 46  # pixels of one grid cell
 MARGIN = 3 * CELL

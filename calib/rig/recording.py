@@ -19,7 +19,7 @@ from mcap.writer import IndexType, Writer
 
 from calib.rig.history import History
 from calib.rig.recording_repair import repair_recording
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
 MAGIC = 8  # bytes at the start of every MCAP file

@@ -28,7 +28,7 @@ from mcap.records import (
 )
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER = Header(profile="roundel", library="roundel")

@@ -10,8 +10,8 @@ from calib.errors import CalibrationError
 from calib.rig.bounds import check_cameras, check_figures
 from calib.rig.camera import Camera
 from calib.rig.history import History
-from camera_node.config import dump_yaml, load_yaml, write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import dump_yaml, load_yaml, write_atomically
+from camera_node.foundation.errors import ConfigError
 
 T = TypeVar("T")
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")  # the fields that every camera needs

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
 from calib.rig.camera import LENS, OFFSET, POSE, Camera, pixel_jacobians, transform
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import CalibrationError
-from camera_node.config import load_yaml
+from camera_node.foundation.config import load_yaml
 from camera_node.geometry.body import Body, PrintedWand
 from camera_node.protocol.messages import Detections
 

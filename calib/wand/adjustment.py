@@ -27,7 +27,7 @@ from calib.wand.quality.checks import check_agreement, check_clocks, check_lense
 from calib.wand.quality.held_out import triangulated_residuals
 from calib.wand.report import Validation
 from calib.wand.trajectory import acceleration_density
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 
 COARSE_SETS, FINE_SETS = 250, 1000  # frame sets of either stage
 MAX_MEASURED = 20_000  # detections whose residuals are stated

@@ -15,7 +15,7 @@ from calib.errors import CalibrationError
 from calib.rig.camera import Camera
 from calib.wand.detections import WandDetections, gather
 from calib.wand.tracks import SAME_S, MarkerTrack
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.protocol.messages import Detections
 
 STILL = 3.0  # standard deviations of one detection: the images of a point that stands still differ by less

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 GROUP_SIZE = 24  # scalars in one block of the factorization, at least: fewer, larger products are faster
 

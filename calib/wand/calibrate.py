@@ -29,7 +29,7 @@ from calib.wand.report import NOT_RECORDED, Exchange
 from calib.wand.result import WandCalibration
 from calib.wand.scale import Distance
 from calib.wand.synchrony import label_by_timing
-from camera_node.arrays import Index
+from camera_node.foundation.arrays import Index
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 

@@ -22,7 +22,7 @@ from calib.wand.report import BackgroundReport, CameraReport, Exchange, Outlier,
 from calib.wand.result import WandCalibration
 from calib.wand.scale import Distance, add_scale_uncertainty, compare_distance
 from calib.world.world_frame import move_rig, upright_frame
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import RawEllipses
 from camera_node.protocol.messages import Detections

@@ -23,7 +23,7 @@ from calib.wand.conclusion import adjusted_camera, clock_values
 from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.labeling.labels import WandRecording, label_recording
 from calib.wand.quality.checks import check_agreement, check_lenses
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
 from camera_node.protocol.messages import Detections

@@ -8,7 +8,7 @@ from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import WandObservations
 from calib.wand.report import ClockJump, WandReport
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from calib.wand.initialization.two_view import TwoViewGeometry
 from calib.wand.labeling.labels import WandRecording, label_recording
 from calib.wand.quality.held_out import triangulated_residuals
 from calib.wand.timing import MIN_COINCIDENT, coincident_share
-from camera_node.arrays import Mask
+from camera_node.foundation.arrays import Mask
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 

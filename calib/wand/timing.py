@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.wand.detections import FrameTable
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 
 MAX_GAP_PERIODS, MAX_GAP_S = 2.5, 0.5  # longest interpolation of a track: frame periods, and seconds
 MAX_SPREAD_S = 0.1  # a hand moves decimetres in this time

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.wand.detections import WandDetections
 from calib.wand.trajectory import hermite
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 
 ROUNDS = 8  # of reweighting in a triangulation
 CAUCHY = 0.003  # scale of the weights: angle between a ray and the point, radians

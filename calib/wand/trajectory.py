@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 
 COPLANAR = 0.01  # of the wand's extent: markers nearer to the basis's span than this add no basis marker

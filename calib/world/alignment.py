@@ -10,7 +10,7 @@ from calib.rig.rig import Rig
 from calib.world.landmarks import locate_landmarks
 from calib.world.still_roundels import find_still_roundels
 from calib.world.world_frame import align_positions, align_standing_wand, check_above
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
 from camera_node.protocol.messages import Detections

@@ -17,7 +17,7 @@ from calib.rig.camera import Camera, transform
 from calib.rig.triangulation import triangulate_point
 from calib.world.still_roundels import StillRoundel, disc_centres
 from calib.world.world_frame import is_collinear
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import rigid_motions
 
 FIT_PX = 6.0  # reprojection distance of a match: rig, survey and detection all have errors

@@ -19,7 +19,7 @@ from calib.rig.camera import Camera, pixel_jacobians, transform
 from calib.world.landmarks import FIT_PX
 from calib.world.still_roundels import StillRoundel
 from calib.world.world_frame import is_collinear
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector, vector_from_rotation
 
 SIGMA_PX = 0.2  # of a mean centre: the centre of the ellipse is not exactly that of the disc

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Array, Mask
 from camera_node.detection.disc_pose import DiscPose, locate
 from camera_node.detection.roundels import Roundel, Roundels
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.outline import half_axes_of
 from camera_node.protocol.messages import Detections
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.arrays import Array
-from camera_node.config import load_yaml
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import load_yaml
+from camera_node.foundation.errors import ConfigError
 
 
 def read_positions(path: Path, key: str = "camera") -> dict[str, Array]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from calib.errors import CalibrationError
 from calib.rig.camera import transform
 from calib.rig.rig import Rig
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose, rigid_motions
 
 MIN_LEVEL = 0.7  # upward component of a plane's normal: below, the plane is a wall

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 WINDOW_NS = 300_000_000_000  # age up to which round trips are used; longer than most network disturbances
 DRIFT = 100e-6  # largest relative drift: two clocks of 50 ppm each in opposite directions

@@ -9,8 +9,9 @@ import msgspec
 import tyro
 from zenoh import Session
 
-from camera_node.config import require_name
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 from camera_node.protocol.camera_requests import (
     Polygon,
     mask_of,
@@ -23,7 +24,6 @@ from camera_node.protocol.messages import Settings
 from camera_node.protocol.server_address import ServerAddress
 from camera_node.protocol.session import open_client
 from camera_node.sources.frame import parse_controls
-from camera_node.terminal import say
 
 
 @dataclass(frozen=True, kw_only=True)

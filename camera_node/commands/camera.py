@@ -13,15 +13,15 @@ import tyro
 from camera_node.commands.camera_check import check_cameras
 from camera_node.commands.camera_list import list_cameras
 from camera_node.commands.relative import RelativeSettings
-from camera_node.config import require_name
-from camera_node.errors import CameraAbsentError, ConfigError
-from camera_node.processes.supervisor import Supervisor
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import CameraAbsentError, ConfigError
+from camera_node.foundation.service import ServiceManager, stopped_by_signals
+from camera_node.foundation.supervisor import Supervisor
+from camera_node.foundation.terminal import say
 from camera_node.protocol.discovery import FoundArena, choose_arena, find_arenas
-from camera_node.service import ServiceManager, stopped_by_signals
 from camera_node.sources.address import without_credentials
 from camera_node.sources.drivers import local_cameras
 from camera_node.sources.frame import SourceSettings
-from camera_node.terminal import say
 
 TICK_S = 0.25
 MAX_CHECK_S = 3600.0

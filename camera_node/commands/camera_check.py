@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array
 from camera_node.commands.publish import open_source
 from camera_node.detection.detector import Detector
 from camera_node.detection.sharpness import edge_blur_px
-from camera_node.errors import CameraError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import CameraError
+from camera_node.foundation.terminal import progress_bar, say
 from camera_node.node.status import BLURRED_PX, advise, advise_focus
 from camera_node.sources.address import without_credentials
 from camera_node.sources.frame import Frame, Source, SourceSettings
-from camera_node.terminal import progress_bar, say
 
 MAX_JITTER_MS = 1.0  # of the stamps; a robot at 1 m/s moves by 1 mm in this time
 MAX_MISSING = 0.01  # share of the frames

@@ -8,13 +8,13 @@ import msgspec
 import tyro
 
 from camera_node.commands.adjust import save_picture
-from camera_node.config import require_name
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 from camera_node.protocol.camera_requests import change_camera, request_cameras, request_snapshot
 from camera_node.protocol.registration import CameraChange, RegisteredCamera
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import open_client
-from camera_node.terminal import say
 
 USES = {"list": "", "rename": "OLD NEW", "forget": "NAME", "why": "NAME [PICTURE.jpg]"}
 N_ARGUMENTS = {"list": (0,), "rename": (2,), "forget": (1,), "why": (1, 2)}

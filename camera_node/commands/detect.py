@@ -12,16 +12,16 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector, DetectorSettings
 from camera_node.detection.disc_pose import locate_all
 from camera_node.detection.overlay import draw_refused, draw_roundels
 from camera_node.detection.refusals import RefusedRing, explain
 from camera_node.detection.roundels import Roundel, Roundels
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.errors import CameraError, ConfigError
+from camera_node.foundation.terminal import console, say
 from camera_node.geometry.lens import Lens, load_lens
 from camera_node.sources.replay import read_grey
-from camera_node.terminal import console, say
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")  # of the pictures of a folder
 PASSES = 2  # over a picture: the first one learns prints and tone curve

@@ -10,12 +10,12 @@ from typing import Annotated, Literal
 import msgspec
 import tyro
 
-from camera_node.config import dump_yaml, example_file, load_yaml, write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import dump_yaml, example_file, load_yaml, write_atomically
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 from camera_node.geometry.body import Body, PrintedWand
 from camera_node.printing.drawing import Page, write_pages
 from camera_node.printing.sheets import Card, board_page, body_page, card_pages, cards_for_page
-from camera_node.terminal import say
 
 EXAMPLES = {"wand": "wand.yaml", "l-frame": "l.yaml", "robot": "robots.yaml"}
 DIAMETER_M = 0.09  # of all examples

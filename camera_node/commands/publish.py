@@ -11,10 +11,10 @@ from typing import Annotated, Literal
 import tyro
 
 from camera_node.commands.relative import RelativeSettings
-from camera_node.config import example_file, require_name
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import example_file, require_name
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.service import ServiceManager, StopEvent, stopped_by_signals
 from camera_node.protocol.registration import CameraRegistration
-from camera_node.service import ServiceManager, StopEvent, stopped_by_signals
 from camera_node.simulation.camera import SimulatedCamera
 from camera_node.sources.address import is_url
 from camera_node.sources.drivers import driver_of

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 if TYPE_CHECKING:
     from camera_node.detection.relative import DiscLocalizer

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node import _core
-from camera_node.arrays import Array, Grey
 from camera_node.detection.roundels import DetectedRoundels
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array, Grey
+from camera_node.foundation.errors import ConfigError
 
 MAX_RATIOS = 16
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
 STEPS = 4  # Gauss-Newton iterations; the poses from the conic are close to the solution

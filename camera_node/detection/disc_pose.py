@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node import _core
-from camera_node.arrays import Array
 from camera_node.detection.disc_adjustment import AdjustedDiscs, adjust, covariance_through, shape_of
 from camera_node.detection.roundels import DetectedRoundels, Roundel, Roundels
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
 BOUNDARY = 24  # points of an ellipse that are undistorted

@@ -7,9 +7,9 @@ See docs/detector_model.md, section 9a.
 import numpy as np
 
 from camera_node import _core
-from camera_node.arrays import Array
 from camera_node.detection.roundels import DetectedRoundels, Roundels
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 
 # Of the learned error of the lens, relative to the largest offset. The least one is that of a focal length that is

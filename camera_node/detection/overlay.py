@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.arrays import Array
 from camera_node.detection.refusals import RefusedRing
 from camera_node.detection.roundels import Roundel, Roundels
+from camera_node.foundation.arrays import Array
 
 GREEN, RED, AMBER = (60, 200, 60), (40, 40, 230), (58, 166, 240)
 MIN_RADIUS_PX = 3.0  # of an ellipse in a preview

@@ -6,9 +6,9 @@ from enum import IntEnum
 
 import numpy as np
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector, DetectorSettings
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array, Grey
 
 
 class Reason(IntEnum):

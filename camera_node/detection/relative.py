@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array
 from camera_node.detection.disc_pose import DiscPoses, distances_by_principal_axis, locate_all
 from camera_node.detection.roundels import DetectedRoundels
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 
 MAX_LOCATED = 64  # of one frame, the largest ones: the work for a frame is bounded

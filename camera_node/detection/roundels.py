@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)

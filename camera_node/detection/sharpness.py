@@ -4,8 +4,8 @@
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array, Grey
 
 MAX_ROUNDELS = 3  # the largest ones are measured
 MIN_RADIUS_PX = 6.0  # of the minor half axis: the edges of smaller roundels merge

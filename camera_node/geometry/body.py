@@ -6,7 +6,7 @@ import math
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 Vector = tuple[float, float, float]
 MAX_EXTENT_M = 10.0  # of a marker's coordinates and of a roundel's diameter

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array
-from camera_node.config import load_yaml
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import load_yaml
+from camera_node.foundation.errors import ConfigError
 
 MAX_FISHEYE_DEG = 89.0  # from the axis; x/z and y/z diverge at 90 degrees
 

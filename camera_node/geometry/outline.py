@@ -17,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
 MAX_SHIFT = 0.3  # radii; where it is larger, the second derivatives do not describe the image

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 
 class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

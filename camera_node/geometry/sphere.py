@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 
 def fibonacci_sphere(n: int) -> Array:

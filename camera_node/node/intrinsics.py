@@ -8,7 +8,7 @@ import zenoh
 
 from camera_node.detection.known_lens import KnownLens
 from camera_node.detection.roundels import DetectedRoundels, Roundels
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.intrinsics import RigLenses

@@ -18,6 +18,8 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import draw_refused, draw_roundels
 from camera_node.detection.refusals import explain
 from camera_node.detection.relative import DiscLocalizer
+from camera_node.foundation.rate_limit import RateLimit
+from camera_node.foundation.service import ServiceManager
 from camera_node.node.clock_sync import ClockSync
 from camera_node.node.intrinsics import RigLens
 from camera_node.node.preview import Content, PreviewPublisher
@@ -38,8 +40,6 @@ from camera_node.protocol.requests import (
     sender_of,
 )
 from camera_node.protocol.session import ServerWatch
-from camera_node.rate_limit import RateLimit
-from camera_node.service import ServiceManager
 from camera_node.sources.frame import Frame, Source
 
 log = logging.getLogger("camera_node")

@@ -9,9 +9,9 @@ from collections.abc import Callable
 import cv2
 import zenoh
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.overlay import draw_preview
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.protocol.messages import MAX_PREVIEW_BYTES, Preview, encode
 
 log = logging.getLogger("camera_node.preview")

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from camera_node.errors import NetworkError, RoundelError
+from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.node.node import Node
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import Keys, MessageError, Settings, decode, encode

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.detection.sharpness import edge_blur_px
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.protocol.messages import CameraStatus
 from camera_node.sources.frame import Frame, Source
 

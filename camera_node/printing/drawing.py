@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from camera_node.config import write_atomically
-from camera_node.errors import ConfigError
-from camera_node.extras import require
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.extras import require
 
 POINT_MM = 25.4 / 72  # PDF's unit
 LINE_MM = 0.15

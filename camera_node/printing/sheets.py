@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.printing.drawing import GREY, Box, Circle, Label, Page, Shape, Stroke
 

@@ -9,8 +9,8 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import Detections, Keys, MessageError, Settings, decode, encode
 from camera_node.protocol.registration import (
     CameraChange,

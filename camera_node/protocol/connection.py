@@ -11,7 +11,7 @@ from pathlib import Path
 
 import zenoh
 
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.session import NO_SERVER, PATIENCE_S, open_endless
 

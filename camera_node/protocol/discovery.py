@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.session import open_client
 
 SCOUT_S = 1.5  # scouting repeats its question after 1 s

@@ -7,8 +7,8 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from camera_node.config import is_name, require_name
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.config import is_name, require_name
 from camera_node.protocol.jpeg import jpeg_size
 
 VERSION = 1

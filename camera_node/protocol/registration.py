@@ -10,7 +10,7 @@ from typing import Annotated
 
 import msgspec
 
-from camera_node.config import is_name
+from camera_node.foundation.config import is_name
 from camera_node.protocol.messages import VERSION, MessageError, Settings
 from camera_node.protocol.requests import RequestSource
 

@@ -6,9 +6,9 @@ import math
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array
-from camera_node.config import is_name
 from camera_node.detection.relative import DIAMETERS_M, LocatedRoundels
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import is_name
 from camera_node.protocol.messages import F4, F8, I4, VERSION, MessageError
 
 MAX_POSITIONS = 256  # in one message; messages with more are refused

@@ -14,8 +14,8 @@ import cv2
 import msgspec
 import zenoh
 
-from camera_node.arrays import Grey
-from camera_node.errors import NetworkError, RoundelError
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.protocol.messages import decode, encode
 from camera_node.protocol.session import ask_server
 

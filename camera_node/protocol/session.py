@@ -10,7 +10,7 @@ from pathlib import Path
 
 import zenoh
 
-from camera_node.errors import AddressError, ConfigError, NetworkError
+from camera_node.foundation.errors import AddressError, ConfigError, NetworkError
 
 log = logging.getLogger("camera_node.network")
 

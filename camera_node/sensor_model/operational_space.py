@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
 PAPER_D = 11.0  # px; the smallest size of a pattern that the paper's detector finds

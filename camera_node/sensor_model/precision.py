@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import skew
 from camera_node.sensor_model.imaging import Imaging

@@ -10,7 +10,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.sensor_model.imaging import Ground, Imaging
 
 BLUR_PX = (0.4, 0.7, 1.0, 1.5, 2.0)  # standard deviation of the lens's blur

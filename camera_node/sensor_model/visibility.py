@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.sensor_model import threshold
 from camera_node.sensor_model.imaging import Imaging

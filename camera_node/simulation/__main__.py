@@ -8,9 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from camera_node.command_line import run_command
-from camera_node.errors import ConfigError
-from camera_node.processes.program import run
+from camera_node.foundation.command_line import run_command
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.program import run
 from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
 

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 Picture = NDArray[np.float32]
 SIZE_M = 10.0  # side of the square floor around the world's origin

@@ -13,7 +13,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.pose import rotation_with_z
 from camera_node.simulation.background import Picture

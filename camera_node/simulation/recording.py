@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import msgspec
 
-from camera_node.config import write_atomically
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import CameraError, ConfigError
+from camera_node.foundation.terminal import track
 from camera_node.geometry.pose import invert
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import WAND, Scene, SceneCamera
-from camera_node.terminal import track
 
 
 def render_recording(

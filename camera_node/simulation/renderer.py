@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array, Grey
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 from camera_node.simulation.background import Picture, paint_floor, plain_floor, view_floor

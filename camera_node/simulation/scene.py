@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array
-from camera_node.config import load_yaml
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import load_yaml
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body, PrintedWand, Vector
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import look_at, rotation_from_vector

@@ -12,7 +12,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array, Grey
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.simulation.background import Picture
 
 WHITE = 255.0

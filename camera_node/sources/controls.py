@@ -7,7 +7,7 @@ from typing import Literal
 
 import msgspec
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import ControlValue
 
 SHOWN = 40  # names that an error lists

@@ -4,7 +4,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.sources.description import CameraDescription
 from camera_node.sources.frame import Source, SourceSettings
 from camera_node.sources.genicam.source import genicam_key, list_genicam, open_genicam

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
-from camera_node.arrays import Grey
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import ControlValue
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Grey
+from camera_node.foundation.arrays import Grey
 
 DEPTHS = (8, 10, 12, 14, 16)  # bits per pixel of image sensors
 

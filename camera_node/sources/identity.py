@@ -5,7 +5,7 @@ import socket
 from dataclasses import dataclass
 from pathlib import Path
 
-from camera_node.config import is_name
+from camera_node.foundation.config import is_name
 from camera_node.sources.address import is_url, without_credentials
 from camera_node.sources.drivers import driver_of
 

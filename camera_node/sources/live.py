@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Protocol
 
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.controls import Control, check_controls
 from camera_node.sources.frame import Frame, Source, SourceSettings, parse_controls

@@ -9,10 +9,10 @@ import numpy as np
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
+from camera_node.foundation.terminal import track
 from camera_node.protocol.messages import Detections
 from camera_node.sources.replay import FrameFolder
-from camera_node.terminal import track
 
 SIGMA_PX = 0.3  # assumed standard deviation of a centre from a file without covariances
 MAX_FPS = 1e5

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.arrays import Grey
 from camera_node.clocks.host_clock import unix_ahead_ns
-from camera_node.errors import CameraAbsentError, CameraError, ConfigError
-from camera_node.extras import require
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.errors import CameraAbsentError, CameraError, ConfigError
+from camera_node.foundation.extras import require
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.controls import Control, check_controls
 from camera_node.sources.description import CameraDescription, Mode

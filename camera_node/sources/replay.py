@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from camera_node.arrays import Grey
-from camera_node.errors import CameraError
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.errors import CameraError
 from camera_node.protocol.registration import CameraAssignment
 from camera_node.sources.frame import Frame, Source, SourceSettings
 from camera_node.sources.grey import to_grey

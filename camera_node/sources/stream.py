@@ -11,11 +11,11 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from camera_node.arrays import Grey
 from camera_node.clocks.arrival_clock import ArrivalClock
 from camera_node.clocks.host_clock import unix_ahead_ns
-from camera_node.errors import CameraAbsentError, CameraError, ConfigError
-from camera_node.extras import require
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.errors import CameraAbsentError, CameraError, ConfigError
+from camera_node.foundation.extras import require
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.address import URL, without_credentials
 from camera_node.sources.controls import Control

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import rotation_from_wxyz, skew
 from fusion.protocol.messages import RobotPose
 

@@ -8,12 +8,12 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from camera_node.errors import AddressError, RoundelError
-from camera_node.extras import require
+from camera_node.foundation.errors import AddressError, RoundelError
+from camera_node.foundation.extras import require
+from camera_node.foundation.rate_limit import RateLimit
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import MessageError, Preview, decode
 from camera_node.protocol.tcp_sockets import tcp_sockets
-from camera_node.rate_limit import RateLimit
 from fusion.bridges.foxglove_channels import FoxgloveChannels
 from fusion.client.arena import Arena
 from fusion.protocol.messages import FusionStatus, Markers

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.extras import require
+from camera_node.foundation.extras import require
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from camera_node.protocol.messages import Preview
 from fusion.model.robots import Robot

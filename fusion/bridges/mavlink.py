@@ -11,8 +11,8 @@ import time
 from collections import Counter
 from typing import Any, Literal
 
-from camera_node.errors import ConfigError, NetworkError
-from camera_node.extras import require
+from camera_node.foundation.errors import ConfigError, NetworkError
+from camera_node.foundation.extras import require
 from camera_node.geometry.pose import wxyz_from_rotation
 from camera_node.node.clock_sync import ClockSync
 from fusion.bridges.mavlink_frames import FrdFrames, FrdPose, roll_pitch_yaw, upper_triangle

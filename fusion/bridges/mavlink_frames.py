@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError
 from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.protocol.messages import RobotPose
 

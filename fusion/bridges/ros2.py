@@ -18,8 +18,8 @@ from functools import cached_property
 
 import zenoh
 
-from camera_node.errors import ConfigError
-from camera_node.logs import about
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.logs import about
 from camera_node.protocol.relative import RelativePositions
 from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, relative_poses, transforms
 from fusion.protocol.messages import RobotPose

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from camera_node.errors import AddressError, ConfigError
+from camera_node.foundation.errors import AddressError, ConfigError
 from fusion.bridges import vrpn_messages as vrpn
 from fusion.bridges.pose_queue import WAIT_S, PoseQueue
 from fusion.protocol.messages import RobotPose

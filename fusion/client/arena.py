@@ -26,8 +26,8 @@ from calib.live.rig_requests import (
 )
 from calib.rig.messages import RigHistory, RigMessage
 from calib.rig.rig import Rig
-from camera_node.config import require_name
-from camera_node.errors import NetworkError
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode

@@ -8,8 +8,8 @@ from typing import Literal
 import msgspec
 import zenoh
 
-from camera_node.config import require_name
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.requests import RequestSource
 from fusion.client.measure import collect_markers, find_stationary_markers, robot_from_markers
 from fusion.model.likeness import distances

@@ -16,7 +16,7 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.protocol.messages import Keys, MessageError, decode
 from fusion.errors import FusionError
 from fusion.model.robots import MotionModel, Robot

@@ -6,8 +6,8 @@ from collections.abc import Collection
 
 import zenoh
 
-from camera_node.config import is_name
-from camera_node.errors import NetworkError
+from camera_node.foundation.config import is_name
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.discovery import ALIVE
 from fusion.protocol.requests import request_robots

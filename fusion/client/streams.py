@@ -10,7 +10,7 @@ import threading
 from collections.abc import AsyncIterator, Callable, Collection, Iterator
 from typing import Generic, TypeVar
 
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.relative import RelativePositions
 from fusion.client.silence import NO_SERVER, no_such_robot

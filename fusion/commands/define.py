@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 from camera_node.protocol.session import open_client
-from camera_node.terminal import say
 from fusion.client.define import RobotDefinition, define_robot, describe
 
 

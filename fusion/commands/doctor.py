@@ -9,8 +9,8 @@ from typing import Annotated
 import msgspec
 import tyro
 
-from camera_node.errors import RoundelError
-from camera_node.terminal import say
+from camera_node.foundation.errors import RoundelError
+from camera_node.foundation.terminal import say
 from fusion.client.arena import Arena
 from fusion.diagnosis.arena import Observation, check_arena, observe
 from fusion.diagnosis.findings import Finding

@@ -4,8 +4,8 @@
 from pathlib import Path
 from typing import Literal
 
-from camera_node.errors import ConfigError
-from camera_node.terminal import say
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 from fusion.export.files import write_c3d, write_csv, write_foxglove, write_rosbag, write_trc, write_tum
 from fusion.export.points import sample_points
 from fusion.export.poses import RecordedPoses

@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 import tyro
 
-from camera_node.terminal import say
+from camera_node.foundation.terminal import say
 from fusion.client.arena import Arena
 from fusion.protocol.health import assess_health
 

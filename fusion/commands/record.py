@@ -7,9 +7,9 @@ from typing import Annotated
 import tyro
 
 from calib.rig.recording import RecordingWriter
+from camera_node.foundation.service import stopped_by_signals
+from camera_node.foundation.terminal import say
 from camera_node.protocol.connection import ServerConnection
-from camera_node.service import stopped_by_signals
-from camera_node.terminal import say
 from fusion.recordings.record import ArenaRecorder
 from fusion.recordings.rotation import RotatingWriter, Rotation
 

@@ -4,8 +4,8 @@
 from pathlib import Path
 from typing import Literal
 
-from camera_node.errors import ConfigError
-from camera_node.terminal import say
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 from fusion.recordings.files import remove_recording, rename_recording
 from fusion.recordings.summary import RecordingSummary, list_recordings
 

@@ -5,8 +5,8 @@ import shutil
 from pathlib import Path
 
 from calib.rig.recording_repair import repair_recording
-from camera_node.errors import ConfigError
-from camera_node.terminal import say
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 
 
 def repair(recording: Path, /, *, out: Path | None = None) -> int:

@@ -3,8 +3,8 @@
 
 from pathlib import Path
 
-from camera_node.errors import ConfigError
-from camera_node.terminal import say, track
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say, track
 from fusion.model.limits import Limits
 from fusion.recordings.frame_sets import recorded_frame_sets
 from fusion.recordings.record import read_recording

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import tyro
 import zenoh
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import open_client
-from camera_node.terminal import say
 from fusion.client.define import LOST_AT_RESTART
 from fusion.model.robot_frame import move_origin, turn_heading
 from fusion.model.robots import Robot, save_robots

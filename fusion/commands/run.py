@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from calib.rig.rig import load_rig
-from camera_node.terminal import say, track
+from camera_node.foundation.terminal import say, track
 from fusion.model.robots import load_robots
 from fusion.recordings.report import Summary, write_poses
 from fusion.recordings.run import OfflineArena, fuse_recording, read_detections

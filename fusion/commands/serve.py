@@ -4,8 +4,8 @@
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from camera_node.config import write_atomically
-from camera_node.service import stopped_by_signals
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.service import stopped_by_signals
 
 
 @dataclass(frozen=True)

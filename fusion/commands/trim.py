@@ -3,7 +3,7 @@
 
 from pathlib import Path
 
-from camera_node.terminal import say
+from camera_node.foundation.terminal import say
 from fusion.recordings.trim import trim_recording
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from calib.rig.rig import Rig
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import CameraStatus
 from fusion.client.arena import Arena
 from fusion.diagnosis.findings import Finding

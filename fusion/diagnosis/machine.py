@@ -16,7 +16,7 @@ from pathlib import Path
 import zenoh
 
 from calib.rig.rig import Rig, load_rig
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 from fusion.diagnosis.findings import Finding
 from fusion.model.robots import load_robots
 from fusion.protocol.health import assess_calibration, calibration_problems, describe_calibration

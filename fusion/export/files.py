@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.config import write_atomically
-from camera_node.errors import ConfigError
-from camera_node.extras import require
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.extras import require
 from fusion.bridges.foxglove_channels import FoxgloveChannels
 from fusion.bridges.ros2 import ros_name
 from fusion.bridges.ros2_messages import odometries, pose_stamped, transforms

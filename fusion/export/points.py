@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.export.poses import RecordedPoses
 

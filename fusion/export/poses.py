@@ -8,7 +8,7 @@ from pathlib import Path
 from calib.rig.camera import Camera
 from calib.rig.messages import RigMessage
 from calib.rig.recording import read_messages
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import MessageError, decode
 from fusion.model.robots import Robot
 from fusion.protocol.messages import RobotPose, Robots

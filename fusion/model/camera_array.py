@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from fusion import _core
 from fusion.model.states import States
 from fusion.model.undistortion import table_of

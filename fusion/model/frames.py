@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
 from fusion.model.undistortion import undistort

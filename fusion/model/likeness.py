@@ -15,7 +15,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rigid_motions
 

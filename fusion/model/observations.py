@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.outline import half_axes_of
 from fusion import _core
 from fusion.model.camera_array import CameraArray, Discs, Exposures, take_columns

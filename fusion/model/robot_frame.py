@@ -6,7 +6,7 @@ import math
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from fusion.errors import FusionError
 from fusion.model.robots import Robot
 

@@ -11,10 +11,10 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from camera_node.config import NAME_RULE, dump_yaml, is_name, load_yaml, write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import NAME_RULE, dump_yaml, is_name, load_yaml, write_atomically
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.text import printable
 from camera_node.geometry.body import Body
-from camera_node.text import printable
 from fusion.errors import FusionError
 from fusion.model.likeness import DISTINCT_M, likeness, sides, symmetry
 

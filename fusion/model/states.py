@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.pose import rotation_from_vector, vector_from_rotation
 from fusion import _core
 

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import RawEllipses, centre_shifts, half_axes_of
 from fusion import _core

@@ -2,7 +2,7 @@
 """Decides which frames of which cameras are used: clocks, frozen images, frames that contradict, moved cameras."""
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Mask
+from camera_node.foundation.arrays import Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from fusion.model.camera_array import CameraArray, Exposures
 from fusion.model.observations import MarkerTable
 from fusion.model.states import States

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Mask
+from camera_node.foundation.arrays import Mask
 from camera_node.geometry.pose import Pose
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array, Index
 from camera_node.detection.roundels import Roundels
-from camera_node.logs import about
+from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.logs import about
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import MarkerTable

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import Camera, pixel_jacobians
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.frames import CalibratedFrame
 

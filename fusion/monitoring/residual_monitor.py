@@ -9,7 +9,7 @@ position and velocity of a robot adapt to them.
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from fusion._core import SLACK_PX
 
 MIN_RESIDUALS = 12  # in a frame set

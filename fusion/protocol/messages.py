@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Index
-from camera_node.config import is_name
+from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.config import is_name
 from camera_node.protocol.messages import VERSION, MessageError
 from camera_node.protocol.requests import RequestSource
 from fusion.model.frames import FrameSet

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import zenoh
 
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
+from camera_node.foundation.text import printable
 from camera_node.protocol.messages import MessageError, decode, encode
 from camera_node.protocol.requests import REQUEST_S, RequestError, RequestSource, send_request
-from camera_node.text import printable
 from fusion.errors import FusionError
 from fusion.model.robots import Robot
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key

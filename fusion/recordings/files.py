@@ -3,8 +3,8 @@
 
 from pathlib import Path
 
-from camera_node.config import require_name
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import ConfigError
 
 SUFFIX = ".mcap"
 

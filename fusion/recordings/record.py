@@ -19,7 +19,7 @@ import zenoh
 from calib.rig.messages import RigMessage
 from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from fusion.model.limits import Limits

@@ -8,7 +8,7 @@ from pathlib import Path
 from calib.rig.camera import Camera
 from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import load_rig
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Keys, encode
 from fusion.model.robots import Robot, load_robots
 from fusion.recordings.record import ArenaRecording

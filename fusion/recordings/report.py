@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.config import write_atomically
+from camera_node.foundation.config import write_atomically
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.messages import RobotPose
 from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.rig.recording import RecordingWriter
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 REPEATED = ("/rig", "/robots")  # ends of keys whose latest message begins each file
 

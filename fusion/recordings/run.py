@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib.rig.camera import Camera
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import detect_frames, read_observations
 from fusion.model.frames import CalibratedFrame, FrameSet

@@ -5,7 +5,7 @@ from collections import Counter
 from pathlib import Path
 
 from calib.rig.recording import RecordingWriter, read_messages
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 CONTEXT = (
     "/rig",

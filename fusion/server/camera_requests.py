@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 import zenoh
 
-from camera_node.logs import about
+from camera_node.foundation.logs import about
 from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.registration import (
     CameraAssignment,

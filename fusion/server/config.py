@@ -5,8 +5,8 @@ from pathlib import Path
 
 import msgspec
 
-from camera_node.config import NAME_RULE, is_name, load_yaml
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import NAME_RULE, is_name, load_yaml
+from camera_node.foundation.errors import ConfigError
 from fusion.model.limits import Limits
 
 

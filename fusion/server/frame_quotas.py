@@ -4,7 +4,7 @@
 import math
 from collections.abc import Collection
 
-from camera_node.rate_limit import RateLimit
+from camera_node.foundation.rate_limit import RateLimit
 
 FRAMES_PER_SET = 4.0  # accepted from one camera, on average: more than the synchronizer's FAR_FASTER
 SLACK = 16  # frames that may arrive at once in addition to those of the lateness limit

@@ -17,6 +17,7 @@ from calib.rig.messages import (
     set_rig_key,
     undo_rig_key,
 )
+from camera_node.foundation.rate_limit import RateLimit
 from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.requests import (
@@ -26,7 +27,6 @@ from camera_node.protocol.requests import (
     parse_request,
     payload_of,
 )
-from camera_node.rate_limit import RateLimit
 from fusion.model.undistortion import prepare_lenses
 from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
 from fusion.server.pipeline import TrackingPipeline

@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from calib.rig.messages import RigMessage
-from camera_node.logs import about
+from camera_node.foundation.logs import about
+from camera_node.foundation.service import ServiceManager
 from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.session import listening_endpoints
 from camera_node.protocol.tcp_sockets import stop_lingering
-from camera_node.service import ServiceManager
 from fusion.errors import FusionError
 from fusion.model.frames import FrameSet
 from fusion.model.undistortion import prepare_lenses

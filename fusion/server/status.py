@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.logs import about
+from camera_node.foundation.logs import about
 from fusion.model.limits import Limits
 from fusion.monitoring.clocks.camera_clocks import ClockHealth
 from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Index
+from camera_node.foundation.arrays import Index
 from fusion._core import SLACK_PX
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import MatchedObservations

@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from fusion._core import SLACK_PX
 from fusion.model.observations import MatchedObservations
 

@@ -10,7 +10,7 @@ since noise of 0.1 px makes all detections outliers of a prediction that is 1 px
 
 import numpy as np
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from fusion import _core
 from fusion.model.observations import MatchedObservations
 from fusion.tracking.estimator import Estimator, Prediction

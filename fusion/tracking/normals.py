@@ -6,7 +6,7 @@ A module of its own because acquisition and the unlabeled tracker both start sin
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.sphere import fibonacci_sphere
 from fusion import _core
 from fusion.model.camera_array import CameraArray

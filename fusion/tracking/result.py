@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet

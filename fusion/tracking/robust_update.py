@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
 from fusion.model.states import POSITION, States
 from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, cost_of

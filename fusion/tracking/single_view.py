@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Index, Mask
 from camera_node.detection.disc_pose import decompose
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import DetectionTable
 from fusion.tracking.gating import AXIS_SIGMA_PX, FORGET_NS, MAX_SPEED_M_S, POSITION_GATE

@@ -13,7 +13,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.pose import vector_from_rotation, wxyz_from_rotation
 from fusion.model.states import OMEGA, POSITION, THETA, VELOCITY, States
 from fusion.tracking.estimator import Prediction

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, MarkerTable
 from fusion.model.robots import Robot

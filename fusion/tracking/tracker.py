@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Index, Mask
+from camera_node.foundation.arrays import Index, Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits

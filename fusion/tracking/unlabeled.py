@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.camera_array import CameraArray, Discs
 from fusion.model.observations import DetectionTable, MatchedObservations
 from fusion.model.robots import MOTIONS

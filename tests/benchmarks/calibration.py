@@ -24,7 +24,7 @@ from rich.table import Table
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from tests.benchmarks.calibration_data import run as run_data
 from tests.benchmarks.calibration_honesty import run as run_honesty

@@ -31,7 +31,7 @@ from calib.rig.camera import Camera, with_distortion
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from camera_node.protocol.messages import Detections

@@ -37,10 +37,10 @@ from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.terminal import track
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rigid_motions
-from camera_node.terminal import track
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, WAND, joint_error, roughly
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import read_observations
 

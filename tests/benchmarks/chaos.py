@@ -14,7 +14,7 @@ from pathlib import Path
 
 import tyro
 
-from camera_node.terminal import say, track
+from camera_node.foundation.terminal import say, track
 from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.chaos_result import SETTLE_S, ChaosResult, Episode, report, save_events
 from tests.benchmarks.faults.judge import Gap

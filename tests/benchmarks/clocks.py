@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from camera_node.terminal import console, say, track
+from camera_node.foundation.terminal import console, say, track
 from tests.benchmarks.faults.arena import small_load
 from tests.benchmarks.faults.live_clocks import Judged, drift_live, set_system_clock
 from tests.benchmarks.fusion_load import Load

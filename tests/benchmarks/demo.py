@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 import zenoh
 
-from camera_node.config import example_file
+from camera_node.foundation.config import example_file
 from camera_node.protocol.messages import CameraStatus, Detections, decode
 from tests.conftest import free_port
 from tests.waiting import wait_for_port

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 import tyro
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.protocol.messages import Detections, decode, encode
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.protocol.messages import Latency, RobotPose, ShardPoses

@@ -13,7 +13,7 @@ from pathlib import Path
 import tyro
 from rich.table import Table
 
-from camera_node.terminal import console, say, track
+from camera_node.foundation.terminal import console, say, track
 from tests.benchmarks.faults.arena import Fuzz, LiveArena, small_load
 from tests.benchmarks.faults.fuzzer import FUZZED
 from tests.benchmarks.faults.judge import WrongPose

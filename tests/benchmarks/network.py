@@ -18,8 +18,8 @@ from typing import Literal, get_args
 import tyro
 import zenoh
 
+from camera_node.foundation.terminal import say
 from camera_node.protocol.messages import Detections, decode
-from camera_node.terminal import say
 from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.network import Namespaces, why_not
 from tests.benchmarks.faults.world import CameraFault

@@ -19,9 +19,9 @@ from rich.table import Table
 
 from calib.wand.calibrate import calibrate
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.terminal import track
 from camera_node.geometry.body import Body
-from camera_node.terminal import track
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.states import States
 from fusion.server.frame_synchronizer import FrameSynchronizer

@@ -41,7 +41,8 @@ def is_record(node: ast.ClassDef) -> bool:
     has_fields = any(isinstance(child, ast.AnnAssign) for child in node.body)
     methods = [child for child in node.body if isinstance(child, ast.FunctionDef)]
     return has_fields and all(
-        {ast.unparse(d).split("(")[0] for d in m.decorator_list} & {"property", "classmethod"} for m in methods
+        {ast.unparse(d).split("(")[0] for d in m.decorator_list} & {"property", "classmethod"}
+        for m in methods
     )
 
 

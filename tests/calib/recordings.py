@@ -12,8 +12,8 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, invert, look_at
 from camera_node.protocol.messages import Detections

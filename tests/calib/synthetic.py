@@ -11,8 +11,8 @@ from calib.rig.camera import Camera, transform
 from calib.rig.rig import Rig
 from calib.wand.quality.agreement import CameraPoses, compare_calibrations
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array, Mask
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vector, vector_from_rotation

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.session import open_client, open_router
 from tests.conftest import free_port

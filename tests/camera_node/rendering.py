@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 FINE = 8
 

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
 from fusion.model.camera_array import CameraArray, Discs, Exposures, Views
 from fusion.model.observations import DetectionTable, MatchedObservations

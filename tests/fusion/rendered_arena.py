@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 from camera_node.simulation.background import paint_floor

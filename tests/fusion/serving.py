@@ -13,7 +13,7 @@ from typing import TypeVar
 import msgspec
 
 from calib.rig.rig import Rig, save_rig
-from camera_node.config import dump_yaml
+from camera_node.foundation.config import dump_yaml
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits

@@ -13,7 +13,7 @@ import pytest
 import tyro
 
 from camera_node.commands.camera import JoinArena
-from camera_node.config import load_yaml
+from camera_node.foundation.config import load_yaml
 from tests.conftest import ROOT, free_port
 from tests.security.lab import KEYS, Lab
 from tests.waiting import wait_for, wait_for_port

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.rig.rig import Rig, load_rig, save_rig
-from camera_node.config import dump_yaml
+from camera_node.foundation.config import dump_yaml
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.connection import ServerConnection

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, TimeoutError
 
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.connection import ServerConnection
 from fusion.client.arena import Arena as Client
 from tests.fusion.serving import DEADLINE_S

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from camera_node.config import example_file
+from camera_node.foundation.config import example_file
 from camera_node.protocol.connection import ServerConnection
 from tests.conftest import ROOT
 from tests.web.browser import loopback

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from tests.conftest import free_port
 from tests.waiting import DEADLINE_S, Inbox, wait_for
 from tests.web.browser import browsing, drawing

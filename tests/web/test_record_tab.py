@@ -12,7 +12,7 @@ from typing import Literal
 import pytest
 from playwright.sync_api import Locator
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.connection import ServerConnection
 from fusion.commands.recordings import recordings
 from fusion.recordings.summary import list_recordings

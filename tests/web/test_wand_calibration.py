@@ -13,8 +13,8 @@ import zenoh
 
 from calib.rig.recording import read_detections, save_wand_recording
 from calib.rig.rig import Rig, load_rig, save_rig
-from camera_node.config import dump_yaml
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import dump_yaml
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client

@@ -20,8 +20,8 @@ from calib.live.rig_requests import set_rig
 from calib.rig.camera import Camera, with_distortion
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
-from camera_node.errors import NetworkError
-from camera_node.processes.supervisor import Supervisor, log_path
+from camera_node.foundation.errors import NetworkError
+from camera_node.foundation.supervisor import Supervisor, log_path
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.session import CONNECT_S
 from camera_node.simulation.scene import Scene

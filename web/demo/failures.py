@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR
+from camera_node.foundation.errors import TEMPORARY_FAILURE, USER_ERROR
 from web.errors import WebError
 
 TAIL_LINES = 8  # of a log, that the message of a failure quotes

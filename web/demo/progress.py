@@ -8,7 +8,7 @@ import numpy as np
 import zenoh
 
 from calib.rig.camera import transform
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.protocol.messages import encode
 from camera_node.simulation.scene import Scene
 from web.demo.score import PoseScore

@@ -14,13 +14,13 @@ from collections.abc import Iterator, Sequence
 
 import zenoh
 
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
+from camera_node.foundation.service import stopped_by_signals
+from camera_node.foundation.supervisor import spawn, stop_all
+from camera_node.foundation.terminal import say
 from camera_node.geometry.pose import Pose
-from camera_node.processes.supervisor import spawn, stop_all
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import listening_endpoints, open_router
-from camera_node.service import stopped_by_signals
-from camera_node.terminal import say
 from fusion.client import Arena
 from web.errors import WebError
 from web.formation.formation import SETTLED_S, FormationScore, controllers, start_world

@@ -10,8 +10,8 @@ from itertools import product
 
 import numpy as np
 
-from camera_node.arrays import Array
 from camera_node.detection.relative import LocatedRoundels
+from camera_node.foundation.arrays import Array
 from web.formation.planar import between, moved, wrap
 
 ACCELERATION = np.array([0.4, 0.4, 0.6])  # of the other robot, as noise: m/s^2 and rad/s^2 per root hertz

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from web.formation.control import Controller, Follower, Leader, place_of
 from web.formation.planar import compose
 from web.formation.world import RobotWorld

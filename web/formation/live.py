@@ -9,7 +9,7 @@ import zenoh
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.relative import DiscLocalizer
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 from camera_node.node.node import Node, NodeOptions
 from camera_node.protocol.relative import RelativePositions
 from camera_node.sources.frame import Frame, Source

@@ -5,7 +5,7 @@ import zlib
 
 import numpy as np
 
-from camera_node.arrays import Array, Grey
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
 from camera_node.simulation.background import Picture, paint_floor

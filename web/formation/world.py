@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from web.formation.planar import moved, wrap
 
 STEP_S = 0.005

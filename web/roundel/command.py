@@ -17,10 +17,10 @@ from importlib.metadata import requires, version
 # Before NumPy is loaded, as in fusion.__main__: `roundel server` runs in this process.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from camera_node.command_line import parse, run_command
-from camera_node.errors import ConfigError, check_command
-from camera_node.logs import set_up_logging
-from camera_node.processes.program import run
+from camera_node.foundation.command_line import parse, run_command
+from camera_node.foundation.errors import ConfigError, check_command
+from camera_node.foundation.logs import set_up_logging
+from camera_node.foundation.program import run
 
 Runner = Callable[[str, Sequence[str], Sequence[str]], int | None]
 

@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,11 +13,11 @@ from typing import Annotated
 
 import tyro
 
-from camera_node.errors import TEMPORARY_FAILURE, USER_ERROR, ConfigError
-from camera_node.processes.supervisor import Supervisor
-from camera_node.service import ServiceManager, stopped_by_signals
+from camera_node.foundation.errors import TEMPORARY_FAILURE, USER_ERROR, ConfigError
+from camera_node.foundation.service import ServiceManager, stopped_by_signals
+from camera_node.foundation.supervisor import Supervisor
+from camera_node.foundation.terminal import say
 from camera_node.sources.frame import SourceSettings
-from camera_node.terminal import say
 from fusion.server.config import ArenaConfig, load_arena
 from web.arena_folder import ArenaFolder
 from web.arena_programs import ArenaPrograms

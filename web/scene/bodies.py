@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from fusion.model.likeness import sides

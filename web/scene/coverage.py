@@ -9,7 +9,7 @@ import viser
 
 from calib.plan.planner import DIAMETER_M, PlannedArena, plan_around
 from calib.rig.rig import Rig
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from web.state.feed import ArenaState
 
 POINTS = 2500  # of the volume, about

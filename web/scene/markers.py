@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from web.colours import LABELED, TRUE_POINT, UNLABELED
 from web.scene.bodies import cylinder_mesh

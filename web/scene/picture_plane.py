@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from web.colours import MASK, SELECTED
 
 CENTRE = np.array([0.0, 0.0, -500.0])  # far from the arena, which is out of view there

@@ -4,7 +4,7 @@
 import numpy as np
 import viser
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from web.state.feed import ArenaState
 

@@ -3,7 +3,7 @@
 
 import viser
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import wxyz_from_rotation
 from web.colours import PREVIEW
 

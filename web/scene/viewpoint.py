@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from calib.rig.rig import Rig
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 FIELD_OF_VIEW = math.radians(42)
 MARGIN = 0.78  # share of half the picture in which the cameras are; the rest is for their frustums and names

@@ -5,7 +5,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from web.colours import PREVIEW, WAND_TRAIL
 
 MAX_TRAIL = 1500  # places; at five a second, a session of five minutes

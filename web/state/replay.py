@@ -12,7 +12,7 @@ from pathlib import Path
 import zenoh
 
 from calib.rig.recording import read_messages
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from fusion.protocol.messages import robots_key
 from web.state.feed import Feed
 

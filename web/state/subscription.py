@@ -11,13 +11,13 @@ import msgspec
 import zenoh
 
 from calib.live.rig_requests import redo_rig, request_rig_history, request_rig_message, undo_rig
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
+from camera_node.foundation.rate_limit import RateLimit
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import request_settings
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.requests import RequestSource
-from camera_node.rate_limit import RateLimit
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.messages import FusionStatus, Markers, Robots, RobotsRequest

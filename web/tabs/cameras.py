@@ -12,8 +12,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from camera_node.config import require_name
-from camera_node.errors import NetworkError, RoundelError
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import change_camera
 from camera_node.protocol.messages import Preview, Settings

@@ -5,8 +5,8 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.arrays import Array
-from camera_node.config import require_name
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import require_name
 from fusion.client.define import describe
 from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
 from fusion.errors import FusionError

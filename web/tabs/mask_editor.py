@@ -8,8 +8,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from camera_node.arrays import Array
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.camera_requests import Polygon, complete_corners, mask_of, mask_polygon
 from camera_node.protocol.messages import Settings
 from web.errors import WebError

@@ -9,7 +9,7 @@ from pathlib import Path
 import viser
 
 from calib.rig.recording import RecordingWriter
-from camera_node.errors import ConfigError, RoundelError
+from camera_node.foundation.errors import ConfigError, RoundelError
 from fusion.recordings.files import recording_path, remove_recording, rename_recording
 from fusion.recordings.record import ArenaRecorder
 from fusion.recordings.summary import RecordingSummary, list_recordings

@@ -8,8 +8,8 @@ from calib.intrinsics.nominal_lens import load_known_lenses
 from calib.live.rig_requests import set_rig
 from calib.rig.changes import holds_rig
 from calib.rig.rig import Rig, save_rig
-from camera_node.config import load_yaml
-from camera_node.errors import RoundelError
+from camera_node.foundation.config import load_yaml
+from camera_node.foundation.errors import RoundelError
 from camera_node.geometry.body import PrintedWand
 from web.state.subscription import Subscription
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import viser
 
-from camera_node.config import require_name
+from camera_node.foundation.config import require_name
 from fusion.errors import FusionError
 from fusion.model.robot_frame import move_origin, turn_heading
 from fusion.model.robots import save_robots

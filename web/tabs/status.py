@@ -7,7 +7,7 @@ import numpy as np
 import viser
 from viser import uplot
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from web.condition import assess
 from web.history import LENGTH_S, Event, EventLog, FigureHistory
 from web.html_tables import COLOURS, MARGIN_PX, small

@@ -18,7 +18,7 @@ from calib.live.wand_position import locate_wand
 from calib.live.wand_session import run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig, save_rig
-from camera_node.config import load_yaml
+from camera_node.foundation.config import load_yaml
 from camera_node.geometry.body import Body, PrintedWand
 from web.colours import PREVIEW
 from web.commands import run_program

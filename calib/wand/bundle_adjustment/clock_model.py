@@ -14,7 +14,7 @@ from calib.wand.bundle_adjustment.covariance import camera_covariance, inflation
 from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, with_information
 from calib.wand.bundle_adjustment.problem import CRYSTAL_DRIFT, SLEWED_DRIFT, Problem, WandObservations
 from calib.wand.timing import Timing
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
 POSSIBLE = 3.0  # standard deviations by which a readout time may exceed the time between two frames

@@ -16,7 +16,7 @@ import numpy as np
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import Problem
 from calib.wand.bundle_adjustment.schur_complement import invert_information
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 
 BLOCK_S = 1.0  # longer than the wand stays in one place
 BLOCKS = 10  # of frame sets in order, where these may be any time apart

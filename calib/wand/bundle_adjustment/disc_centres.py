@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_markers
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import centre_shifts, half_axes_of

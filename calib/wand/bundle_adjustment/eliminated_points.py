@@ -15,7 +15,7 @@ from calib.rig.camera import LENS, PER_CAMERA, pixel_jacobians
 from calib.wand.background import BackgroundPoints
 from calib.wand.bundle_adjustment.problem import Problem, State
 from calib.wand.tracks import intersect
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 
 BEHIND = 1e4  # sigmas: the residual of a point behind its camera
 STEPS = 3  # of Gauss-Newton: a point moves little while its cameras take one step

@@ -5,7 +5,7 @@ import numpy as np
 
 from calib.wand.detections import WandDetections
 from calib.wand.tracks import SAME_S
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 
 WINDOW = 8  # consecutive frame sets that are chosen together, so that the motion between them is estimated
 CELLS = (4, 3)  # columns and rows of an image, for coverage

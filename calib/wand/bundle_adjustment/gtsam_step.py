@@ -10,7 +10,7 @@ import numpy as np
 from calib.rig.camera import PER_CAMERA, READOUT
 from calib.wand.bundle_adjustment.linear_system import LinearSystem
 from calib.wand.bundle_adjustment.problem import Problem
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 
 GROUP_SIZE = 24  # scalars in one variable, at least: few large factors are faster, though mostly zero
 

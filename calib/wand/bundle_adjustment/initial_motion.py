@@ -7,7 +7,7 @@ import numpy as np
 
 from calib.wand.tracks import MarkerTrack, triangulate
 from calib.wand.trajectory import AffineWand
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 
 LENGTH_TOLERANCE = 0.25  # of a wand length: beyond, a detection is wrong
 SPIKE = 5.0  # of the median deviation from the neighbours' straight line

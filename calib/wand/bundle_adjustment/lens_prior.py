@@ -19,7 +19,7 @@ from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import inverse_information
 from calib.wand.bundle_adjustment.optimizer import Adjusted
 from calib.wand.bundle_adjustment.problem import Problem
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 
 # Usual standard deviations of the parameters of a lens whose file has none, between a data sheet, or a careless

@@ -22,7 +22,7 @@ from calib.wand.bundle_adjustment.residuals import (
     motion_errors,
     predict_markers,
 )
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 
 STEP_SIGMA_M = 0.5  # of a position's change in one step: damps positions that too few cameras observe
 

@@ -23,7 +23,7 @@ from calib.wand.bundle_adjustment.residuals import (
     reprojection_errors,
 )
 from calib.wand.bundle_adjustment.schur_complement import profile_motion
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 
 CAUCHY_SCALE = 2.3849  # sigmas: 95 % efficient on normal residuals
 REJECTED = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 degrees)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib.rig.camera import LENS, PER_CAMERA, POSE, with_distortion
 from calib.wand.background import BackgroundPoints
 from calib.wand.trajectory import AffineWand
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
 

@@ -18,7 +18,7 @@ from calib.wand.labeling.labels import WandRecording
 from calib.wand.timing import Timing
 from calib.wand.tracks import MarkerTrack, build_tracks
 from calib.wand.trajectory import AffineWand, acceleration_density, finite_velocities
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 

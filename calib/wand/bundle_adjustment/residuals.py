@@ -20,7 +20,7 @@ from calib.wand.trajectory import (
     velocity_weights,
     whitened_constant_velocity,
 )
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens
 
 LENGTH_SIGMA_M = 2e-4  # by which a wand bends while it moves

@@ -13,7 +13,7 @@ from calib.rig.camera import PER_CAMERA
 from calib.wand.block_tridiagonal import BlockTridiagonal
 from calib.wand.bundle_adjustment.linear_system import LinearSystem
 from calib.wand.bundle_adjustment.problem import Problem, State, gauge_directions
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.wand.detections import WandDetections
 from calib.wand.tracks import MarkerTrack, interpolate
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 
 RANGE_S = 0.32  # largest trial shift: twice the difference of clocks that the server synchronizes
 STEP_S = 0.01

@@ -15,7 +15,7 @@ from calib.wand.initialization.clock_shift import FITTED, epipolar_misfits, spre
 from calib.wand.initialization.initial_rig import InitialRig
 from calib.wand.initialization.two_view import MIN_FRAME_SETS, TwoViewGeometry
 from calib.wand.tracks import interpolate
-from camera_node.arrays import Index
+from camera_node.foundation.arrays import Index
 
 # Inlier ratio and frames of two cameras once the fault is undone: a short piece of a smooth path fits many geometries.
 MIN_RATIO, MIN_FRAMES = 0.8, 60

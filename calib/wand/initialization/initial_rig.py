@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.wand.initialization.two_view import MIN_FRAME_SETS, MIN_INLIER_RATIO, TwoView, TwoViewGeometry
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import invert
 
 

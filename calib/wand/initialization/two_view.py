@@ -16,7 +16,7 @@ from calib.wand.detections import WandDetections, ranges
 from calib.wand.initialization.clock_shift import find_shift, spread_evenly, supports_shift
 from calib.wand.timing import Timing
 from calib.wand.tracks import SAME_S, MarkerTrack, build_tracks, interpolate
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert

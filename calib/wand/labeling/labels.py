@@ -18,7 +18,7 @@ from calib.wand.detections import FrameTable, WandDetections, gather
 from calib.wand.labeling.spacing import MAX_ROUNDELS, label_by_spacing, require_distinct
 from calib.wand.labeling.two_markers import label_ends
 from calib.wand.timing import Timing
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.wand.detections import WandDetections, ranges
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 

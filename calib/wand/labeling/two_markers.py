@@ -25,7 +25,7 @@ from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
 from calib.wand.initialization.two_view import TwoViewGeometry, sampson
 from calib.wand.timing import Timing
 from calib.wand.trajectory import finite_velocities, hermite
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, skew

@@ -11,7 +11,7 @@ from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import adjoint, invert, rigid_motions, vector_from_rotation
 
 SIGNIFICANCE = 1e-3  # probability below which a difference is not due to chance

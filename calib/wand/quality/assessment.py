@@ -11,7 +11,7 @@ from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_cov
 from calib.wand.quality.grade import CameraQuality, RigQuality
 from calib.wand.report import NOT_RECORDED
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
 

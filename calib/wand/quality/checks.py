@@ -14,7 +14,7 @@ from calib.wand.bundle_adjustment.problem import WandObservations
 from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_markers
 from calib.wand.detections import WandDetections, ranges
 from calib.wand.quality.clock_jump import find_jump
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 

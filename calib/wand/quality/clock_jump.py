@@ -25,7 +25,7 @@ from calib.wand.bundle_adjustment.problem import (
 )
 from calib.wand.bundle_adjustment.residuals import find_weights, whitened_errors
 from calib.wand.report import ClockJump
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 # A jump that does not disturb the rig leaves neither: the rejected share of a camera's observations, and its drift,
 # s/s.

@@ -19,7 +19,7 @@ from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.bundle_adjustment.residuals import predict_markers
 from calib.wand.report import Exchange
 from calib.wand.tracks import intersect
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens
 
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera

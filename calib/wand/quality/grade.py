@@ -14,7 +14,7 @@ import numpy as np
 from calib.rig.coverage import Coverage, enumerate_words
 from calib.rig.precision_map import SIGMA_PX, PrecisionMap
 from calib.wand.report import Validation
-from camera_node.arrays import Mask
+from camera_node.foundation.arrays import Mask
 
 GRADES = "ABCD"
 # Largest value for A, B and C; a larger one is D.

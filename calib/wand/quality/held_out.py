@@ -12,7 +12,7 @@ from calib.wand.bundle_adjustment.problem import State
 from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
 from calib.wand.report import Validation
 from calib.wand.tracks import interpolate, intersect
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 
 GROSS = 4.5  # standard deviations of the residuals: a larger one is a gross error, as in the adjustment

@@ -10,7 +10,7 @@ import numpy as np
 from calib.rig.camera import LENS, lens_parameters
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.optimizer import Adjusted
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
 CLEAR = 2.0  # sigmas, root mean square of the parameters, above which a lens is reported as changed

@@ -23,7 +23,7 @@ from ctypes.util import find_library
 from functools import cache
 from typing import Any
 
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 
 LIBRARIES = {"aravis": "libaravis-0.8.so.0", "gobject": "libgobject-2.0.so.0", "glib": "libglib-2.0.so.0"}
 NAMES = {"aravis": "aravis-0.8", "gobject": "gobject-2.0", "glib": "glib-2.0"}  # for other systems than Linux

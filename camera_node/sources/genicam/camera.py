@@ -8,7 +8,7 @@ from ctypes import byref, c_double, c_int, c_int64, c_ubyte
 from dataclasses import dataclass
 
 from camera_node.clocks.clock_offset import RoundTrip
-from camera_node.errors import CameraAbsentError, CameraError
+from camera_node.foundation.errors import CameraAbsentError, CameraError
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.controls import Control
 from camera_node.sources.description import Mode

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.arrays import Grey
+from camera_node.foundation.arrays import Grey
 from camera_node.sources.grey import BAYER
 
 NAME = re.compile(r"(Mono|BayerRG|BayerGR|BayerGB|BayerBG)(8|10|12|14|16)(p|Packed)?")

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from camera_node.clocks.device_clock import DeviceClock
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.controls import Control, check_controls
 from camera_node.sources.description import CameraDescription

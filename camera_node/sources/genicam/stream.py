@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Grey
+from camera_node.foundation.arrays import Grey
 from camera_node.sources.genicam.aravis import AravisError, load_aravis
 from camera_node.sources.genicam.camera import GenicamCamera
 from camera_node.sources.genicam.pixels import PixelFormat

@@ -5,7 +5,7 @@ import ctypes
 import re
 from collections.abc import Iterator, Mapping
 
-from camera_node.errors import CameraError
+from camera_node.foundation.errors import CameraError
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.controls import Control
 from camera_node.sources.v4l2.kernel import (

@@ -4,7 +4,7 @@
 import re
 from pathlib import Path
 
-from camera_node.errors import CameraAbsentError, CameraError
+from camera_node.foundation.errors import CameraAbsentError, CameraError
 from camera_node.sources.address import without_credentials
 from camera_node.sources.description import CameraDescription, Mode
 from camera_node.sources.v4l2.controls import ControlSet

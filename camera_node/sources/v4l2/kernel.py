@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from ctypes import c_char, c_int32, c_int64, c_uint8, c_uint32, c_uint64, c_void_p
 from pathlib import Path
 
-from camera_node.errors import CameraAbsentError
+from camera_node.foundation.errors import CameraAbsentError
 
 MAX_ITEMS = 1024  # of one list of a driver, against drivers that never end it
 

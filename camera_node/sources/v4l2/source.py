@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import cv2
 
 from camera_node.clocks.host_clock import unix_ahead_ns
-from camera_node.errors import CameraAbsentError, CameraError, ConfigError
+from camera_node.foundation.errors import CameraAbsentError, CameraError, ConfigError
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.controls import Control, check_controls
 from camera_node.sources.frame import Frame, SourceSettings

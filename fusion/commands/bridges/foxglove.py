@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`fusion foxglove`: an arena live in Foxglove."""
 
-from camera_node.service import stopped_by_signals
-from camera_node.terminal import say
+from camera_node.foundation.service import stopped_by_signals
+from camera_node.foundation.terminal import say
 from fusion.bridges.foxglove import ArenaContent, serving
 from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`fusion vrpn`: an arena's robots as trackers of VRPN."""
 
-from camera_node.service import stopped_by_signals
-from camera_node.terminal import say
+from camera_node.foundation.service import stopped_by_signals
+from camera_node.foundation.terminal import say
 from fusion.bridges.pose_queue import LOCAL, Server, log_faults
 from fusion.bridges.vrpn import VrpnServer
 

@@ -17,8 +17,8 @@ from typing import Literal
 
 import numpy as np
 
-from camera_node.arrays import Mask
-from camera_node.logs import about
+from camera_node.foundation.arrays import Mask
+from camera_node.foundation.logs import about
 from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable

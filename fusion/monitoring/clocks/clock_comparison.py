@@ -10,7 +10,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from camera_node.arrays import Mask
+from camera_node.foundation.arrays import Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
 from fusion.monitoring.clocks.clock_drift import HALF_NS, Drift, DriftMonitor, with_mean_velocities

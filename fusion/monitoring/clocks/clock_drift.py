@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera_node.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Mask
 from fusion.model.states import States
 from fusion.monitoring.clocks.time_offsets import Disagreement, OffsetInformation, contradiction
 from fusion.monitoring.clocks.time_search import Snapshot

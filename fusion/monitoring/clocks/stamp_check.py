@@ -5,7 +5,7 @@ from collections import deque
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from fusion.monitoring.clocks.undecided_jump import (
     MAX_SWAPPED,
     MIN_IRREGULAR,

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import MatchedObservations
 from fusion.model.states import POSITION, THETA, States

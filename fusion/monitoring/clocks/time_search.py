@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.camera_array import CameraArray, Exposures
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import MarkerTable

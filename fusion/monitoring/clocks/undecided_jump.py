@@ -14,7 +14,7 @@ from math import floor
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 MIN_JUMP_NS = 4_000_000
 MIN_IRREGULAR = 0.1  # of the interval between frames

@@ -18,8 +18,8 @@ from calib.rig.changes import MAX_CHANGE, RigChange, describe_change, holds_rig,
 from calib.rig.history import History
 from calib.rig.messages import MAX_VERSIONS, RigHistory, RigMessage, RigVersion
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
-from camera_node.config import write_atomically
-from camera_node.errors import ConfigError, RoundelError
+from camera_node.foundation.config import write_atomically
+from camera_node.foundation.errors import ConfigError, RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.model.corrections import correct, is_corrected
 from fusion.server.storage.persistence import is_newer

@@ -10,10 +10,10 @@ from typing import Any
 import msgspec
 import zenoh
 
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
+from camera_node.foundation.rate_limit import RateLimit
+from camera_node.foundation.text import printable
 from camera_node.protocol.requests import RequestSource, payload_of, sender_of
-from camera_node.rate_limit import RateLimit
-from camera_node.text import printable
 from fusion.server.storage.audit_file import AuditFile
 
 log = logging.getLogger("fusion.audit")

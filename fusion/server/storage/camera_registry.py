@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 
-from camera_node.config import dump_yaml, is_name, load_yaml, write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import dump_yaml, is_name, load_yaml, write_atomically
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Settings
 from camera_node.protocol.registration import CameraChange, CameraRegistration, RegisteredCamera
 from camera_node.protocol.requests import RequestError

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 
 log = logging.getLogger("fusion")
 T = TypeVar("T")

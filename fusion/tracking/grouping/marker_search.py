@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.tracking.gating import ANY_DIAMETERS, DIAMETER_TOLERANCE

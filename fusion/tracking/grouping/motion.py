@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.tracking.gating import DIAMETER_TOLERANCE, MAX_SPEED_M_S
 from fusion.tracking.grouping.rays import SIGMAS, Rays, misses_of_all
 

@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from camera_node.arrays import Index
+from camera_node.foundation.arrays import Index
 from fusion.model.camera_array import CameraArray
 from fusion.model.observations import DetectionTable
 from fusion.tracking.grouping.rays import rays_of

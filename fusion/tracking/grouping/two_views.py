@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from fusion import _core
 from fusion.tracking.grouping.motion import triangulate
 from fusion.tracking.grouping.rays import SIGMAS, Rays, misses

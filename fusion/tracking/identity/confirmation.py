@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from fusion.model.states import VELOCITY, States
 from fusion.tracking.gating import POSITION_GATE
 from fusion.tracking.identity.identification import RefinedFits

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.observations import Assignments
 from fusion.model.robots import Robot
 from fusion.model.states import States

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.states import POSITION
 from fusion.tracking.gating import DIAMETER_TOLERANCE, POSITION_GATE
 from fusion.tracking.grouping.multiview import Marker

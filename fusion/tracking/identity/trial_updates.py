@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from camera_node.detection.detector import Detector
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from tests.benchmarks.detector import (
     accuracy,
     bent,

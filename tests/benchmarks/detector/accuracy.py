@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rich.console import Console
 
-from camera_node.arrays import Array
 from camera_node.detection.disc_pose import DiscPose, locate
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.bound import Bound, bound
 from tests.benchmarks.detector.cells import Cell, cells, views
 from tests.benchmarks.detector.pictures import expose

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from rich.console import Console
 
-from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundel
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from tests.benchmarks.detector.pictures import NOISE, F, expose
 from tests.benchmarks.detector.table import Run, Verdict, table

@@ -12,9 +12,9 @@ from functools import partial
 import numpy as np
 from rich.console import Console
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundel
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.simulation.sensor import SENSORS, Sensor
 from tests.benchmarks.detector.negatives import COMMON, clutter, letters, rings, text_pages
 from tests.benchmarks.detector.photographs import photographs

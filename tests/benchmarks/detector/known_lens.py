@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from rich.console import Console
 
-from camera_node.arrays import Array
 from camera_node.detection.disc_pose import locate
 from camera_node.detection.known_lens import KnownLens
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.bound import PoseBound, pose_bound
 from tests.benchmarks.detector.cells import Cell, views
 from tests.benchmarks.detector.pictures import expose

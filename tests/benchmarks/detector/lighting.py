@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from rich.console import Console
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.simulation.sensor import Sensor
 from tests.benchmarks.detector.cameras import Disturb, acquainted, errors
 from tests.benchmarks.detector.pictures import Card

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from rich.console import Console
 
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.negatives import clutter, letters, text_pages
 from tests.benchmarks.detector.photographs import photographs
 from tests.benchmarks.detector.pictures import NOISE, Card, Grey, dead_leaves, expose, flat, paste

@@ -8,7 +8,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array, Grey
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
 from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from rich.console import Console
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.pictures import (
     NOISE,
     Card,

@@ -8,7 +8,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.pictures import NOISE, Card, Grey, expose
 from tests.benchmarks.detector.table import milliseconds
 

@@ -17,13 +17,13 @@ import msgspec
 import numpy as np
 import tyro
 
-from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import DetectedRoundels, Roundels
+from camera_node.foundation.arrays import Grey
+from camera_node.foundation.logs import set_up_logging
+from camera_node.foundation.program import run
 from camera_node.geometry.pose import Pose, rotation_from_vector
-from camera_node.logs import set_up_logging
 from camera_node.node.node import Node, NodeOptions
-from camera_node.processes.program import run
 from camera_node.protocol.messages import MAX_ROUNDELS
 from camera_node.protocol.session import open_client
 from camera_node.sources.frame import Frame, Source

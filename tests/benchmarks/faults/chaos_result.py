@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from camera_node.terminal import console, say
+from camera_node.foundation.terminal import console, say
 from tests.benchmarks.faults.judge import Gap, WrongPose
 from tests.benchmarks.faults.kinds import LONGEST_S, SHORT_S, Fault
 from tests.benchmarks.faults.memory import Growth

@@ -17,10 +17,10 @@ import tyro
 import zenoh
 
 from calib.rig.messages import redo_rig_key, rig_history_key, undo_rig_key
+from camera_node.foundation.terminal import say
 from camera_node.protocol.messages import Keys, Settings
 from camera_node.protocol.registration import assigned_key, change_key, register_key, registered_key
 from camera_node.protocol.session import open_client
-from camera_node.terminal import say
 from fusion.protocol.messages import RobotsRequest
 from tests.benchmarks.faults.mutation import certainly_invalid, clone, mutate, odd_text
 

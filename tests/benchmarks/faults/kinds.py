@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from msgspec.structs import replace
 
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 from tests.benchmarks.faults.arena import Fuzz, LiveArena
 from tests.benchmarks.faults.reports import Evidence, advised, gone, late, suspected
 from tests.benchmarks.faults.world import CameraFault, RobotEvent

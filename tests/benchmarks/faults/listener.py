@@ -10,9 +10,9 @@ import time
 
 import tyro
 
-from camera_node.errors import NetworkError
-from camera_node.processes.program import run
-from camera_node.terminal import say
+from camera_node.foundation.errors import NetworkError
+from camera_node.foundation.program import run
+from camera_node.foundation.terminal import say
 from fusion.client.arena import Arena
 
 PERIOD_S = 0.1

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.faults.memory import Growth, anonymous_mb, growth
 
 END_S = 10.0  # within which a program ends after SIGTERM

@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from fusion.model.states import States
 from tests.benchmarks.fusion_load import Load
 

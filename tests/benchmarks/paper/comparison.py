@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.arrays import Array, Grey
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
 from camera_node.simulation.sensor import SENSORS, Sensor
 from tests.benchmarks.detector.recall import blur_by_motion

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from camera_node.detection.disc_pose import distance_by_principal_axis
 from camera_node.detection.disc_pose import locate as locate_disc
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.sensor_model.imaging import Imaging
 from camera_node.sensor_model.precision import predict_precision

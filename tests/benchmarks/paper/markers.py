@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.disc_pose import locate as locate_disc
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
 from tests.benchmarks.paper.published import PATTERN
 from tests.benchmarks.paper.reference import PaperDetector, locate

@@ -7,8 +7,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Grey
 from camera_node.geometry.lens import Lens
 from camera_node.sensor_model.operational_space import PAPER_D, Pattern, farthest_distance, operational_space
 from camera_node.sensor_model.visibility import detection_range, is_detected

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array, Grey, Index, Mask
 from camera_node.detection.disc_pose import decompose
+from camera_node.foundation.arrays import Array, Grey, Index, Mask
 from camera_node.geometry.lens import Lens
 
 THETA = 128.0

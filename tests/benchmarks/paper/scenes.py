@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from camera_node.arrays import Array, Grey, Mask
+from camera_node.foundation.arrays import Array, Grey, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector
 from camera_node.sensor_model.operational_space import Pattern

@@ -7,8 +7,8 @@ from itertools import cycle
 
 import numpy as np
 
-from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Grey
 from tests.benchmarks.detector.pictures import Card, dead_leaves, expose, paste
 from tests.benchmarks.detector.table import milliseconds, milliseconds_prepared
 from tests.benchmarks.paper import published

@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Array
 from camera_node.sensor_model import threshold
 from camera_node.sensor_model.imaging import Ground, Imaging
 from camera_node.simulation import background, renderer

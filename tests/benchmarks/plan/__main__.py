@@ -21,8 +21,8 @@ from calib.plan.description import Plan, PlannedRobots
 from calib.plan.placement import PlacementProblem, SuggestedPlaces, evaluate_placement, suggest_placement
 from calib.plan.planner import PlannedArena, evaluate
 from calib.plan.views import CUT_EXPONENT
-from camera_node.arrays import Array
-from camera_node.terminal import progress_bar
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.terminal import progress_bar
 from tests.benchmarks.plan.arena import DIAMETER_M, HALF_M, HEIGHTS_M, SMALL_M
 from tests.benchmarks.plan.coverage import CoverageResult, measure_coverage, measure_cut
 from tests.benchmarks.plan.precision import PrecisionResult, measure_precision

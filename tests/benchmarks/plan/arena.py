@@ -12,7 +12,7 @@ from calib.plan.camera_kind import CameraKind
 from calib.plan.description import ImageQuality, Plan, PlannedRobots
 from calib.plan.planner import PlannedArena
 from calib.rig.camera import Camera
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from camera_node.simulation.renderer import BLACK, WHITE
 from camera_node.simulation.scene import Scene
 

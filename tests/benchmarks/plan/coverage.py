@@ -12,10 +12,10 @@ import numpy as np
 from calib.plan.planner import PlannedArena
 from calib.plan.views import RoundelSensor
 from calib.rig.camera import Camera
-from camera_node.arrays import Array
 from camera_node.detector import Detector
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.terminal import track
 from camera_node.simulation.renderer import Renderer
-from camera_node.terminal import track
 from tests.benchmarks.plan.arena import DIAMETER_M, HALF_M, HEIGHTS_M, image_of, planned_arena, write_scene
 
 REACH_M = 0.15  # half length of paths through edges of the image

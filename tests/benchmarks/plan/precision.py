@@ -11,11 +11,11 @@ import numpy as np
 
 from calib.plan.planner import PlannedArena
 from calib.rig.camera import Camera
-from camera_node.arrays import Array
 from camera_node.detector import Detector
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.terminal import track
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import Scene
-from camera_node.terminal import track
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot

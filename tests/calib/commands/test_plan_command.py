@@ -14,9 +14,9 @@ from calib.plan import placement
 from calib.plan.catalogue import CATALOGUE
 from calib.plan.description import Plan
 from calib.rig.rig import Rig, save_rig
-from camera_node.command_line import parse
-from camera_node.config import load_yaml
-from camera_node.errors import ConfigError
+from camera_node.foundation.command_line import parse
+from camera_node.foundation.config import load_yaml
+from camera_node.foundation.errors import ConfigError
 from tests.conftest import ROOT
 
 SHIPPED = ROOT / "configs" / "plan.yaml"
@@ -86,6 +86,6 @@ def test_the_catalogue_is_listed(capsys: pytest.CaptureFixture[str]):
     ],
 )
 def test_mistakes_are_named(options: tuple, message: str):
-    """Before any work; `camera_node.errors.run` makes one line and exit code 2 of them."""
+    """Before any work; `camera_node.foundation.errors.run` makes one line and exit code 2 of them."""
     with pytest.raises(ConfigError, match=re.escape(message)):
         parse(PlanArena, "roundel plan", [str(option) for option in options]).execute()

@@ -19,7 +19,7 @@ from calib.rig.camera import transform
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.rig.wand_file import WandBody
 from calib.wand.calibrate import calibrate
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_from_wxyz
 from camera_node.sources.observations import read_observations

@@ -28,7 +28,7 @@ from calib.intrinsics.images import read_frames
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector
 from tests.calib.boards import LENS, SPEC, Pose, board_poses, render

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib.intrinsics.images import find_cameras, read_frames, take_snapshots
-from camera_node.errors import CameraError
+from camera_node.foundation.errors import CameraError
 from camera_node.protocol.messages import Keys
 from camera_node.protocol.requests import encode_jpeg, parse_quality, respond
 from camera_node.protocol.session import open_client, open_router

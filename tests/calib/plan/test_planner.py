@@ -14,7 +14,7 @@ from calib.plan.precision import FLOOR_PX, Uncertainty, combine_views, expected_
 from calib.plan.views import RoundelSensor
 from calib.rig.camera import Camera
 from calib.rig.triangulation import triangulate_point
-from camera_node.config import load_yaml
+from camera_node.foundation.config import load_yaml
 from camera_node.sensor_model.operational_space import Pattern
 from camera_node.sensor_model.visibility import is_detected, is_in_image
 from fusion.model.limits import Limits

@@ -11,7 +11,7 @@ import pytest
 from calib.errors import CalibrationError
 from calib.rig.history import MAX_OLD, History
 from calib.rig.rig import Rig, load_rig, save_rig
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from tests.calib.synthetic import ring
 from tests.conftest import ROOT
 

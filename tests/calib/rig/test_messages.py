@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from calib.errors import CalibrationError
 from calib.rig.messages import RigMessage, RigRequest
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import MessageError, decode, encode
 from camera_node.protocol.requests import RequestError, RequestSource, parse_request
 from tests.calib.rig.hostile import as_publication, hostile_messages

@@ -9,7 +9,7 @@ from calib.errors import CalibrationError
 from calib.rig.camera import PER_CAMERA, POSE, Camera
 from calib.rig.triangulation import JointCovariance, camera_jacobians, point_covariances, triangulate_point
 from calib.wand.bundle_adjustment.problem import State
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from tests.calib.synthetic import disturb, random_covariance, ring
 
 

@@ -8,7 +8,7 @@ import pytest
 from calib.errors import CalibrationError
 from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from tests.calib.synthetic import WAND, record, ring
 
 

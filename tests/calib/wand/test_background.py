@@ -13,8 +13,8 @@ from calib.wand.background import match_points
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array, Index
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rigid_motions, rotation_from_vector
 from camera_node.protocol.messages import Detections

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calib.wand.block_tridiagonal import GROUP_SIZE, BlockTridiagonal
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 # Scalars of a block, and blocks: less than a group, whole groups, and a part of one at the end; blocks above a group.
 SIZES = [(6, 2), (6, 3), (6, 8), (6, 21), (12, 2), (12, 7), (24, 5), (30, 4)]

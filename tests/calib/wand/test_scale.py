@@ -16,7 +16,7 @@ from calib.rig.rig import load_rig, save_rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
 from calib.wand.scale import Distance, compare_distance
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.sources.observations import write_observations
 from tests.calib.recordings import WandScenario

@@ -10,7 +10,7 @@ from calib.errors import CalibrationError
 from calib.world.landmarks import locate_landmarks
 from calib.world.still_roundels import find_still_roundels
 from calib.world.world_frame import align_positions, align_standing_wand, check_above
-from camera_node.config import load_yaml
+from camera_node.foundation.config import load_yaml
 from camera_node.geometry.body import Body
 from tests.calib.synthetic import ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world, see_discs

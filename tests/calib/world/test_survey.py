@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from calib.world.survey import read_positions
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 
 def test_positions_are_read_from_yaml_and_csv(tmp_path: Path):

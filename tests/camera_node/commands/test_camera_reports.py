@@ -13,7 +13,7 @@ import tyro
 
 from camera_node.commands.camera import JoinArena
 from camera_node.commands.camera_check import check_camera
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.rendering import Disc, render
 from tests.conftest import ROOT

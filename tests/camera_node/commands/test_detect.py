@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from camera_node.commands.detect import Detect
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 from tests.camera_node.rendering import Disc, expose, render
 
 

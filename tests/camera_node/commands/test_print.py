@@ -12,9 +12,9 @@ import pytest
 
 from calib.intrinsics.board import make_charuco_board, make_finder
 from camera_node.commands.print import DIAMETER_M, Sheet
-from camera_node.config import example_file, load_yaml
 from camera_node.detection.detector import Detector
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import example_file, load_yaml
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.sources.replay import read_grey
 from fusion.model.robots import load_robots

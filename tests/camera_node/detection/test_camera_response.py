@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.simulation.sensor import HARSH, MILD, Sensor
 from tests.benchmarks.detector.cameras import (
     Errors,

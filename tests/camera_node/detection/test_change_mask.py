@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.pictures import Card, Grey, dead_leaves, expose, flat, missed, paste
 
 SIZE = (240, 320)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from camera_node import _core
 from camera_node.detection.detector import Detector
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from tests.camera_node.rendering import Disc, expose, outer_conic, render
 
 PRINCIPAL = np.array([79.5, 59.5])

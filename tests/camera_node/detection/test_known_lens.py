@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from camera_node.detection.known_lens import MIN_SIGMA, KnownLens
 from camera_node.detection.roundels import DetectedRoundels
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace
 

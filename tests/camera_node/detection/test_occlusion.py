@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundel
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.negatives import COMMON, print_letters, rings
 from tests.benchmarks.detector.pictures import Card, flat, grid, paste
 from tests.benchmarks.detector.recall import occluded, recall

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.simulation.sensor import CLEAN, MILD, Sensor
 from tests.benchmarks.detector.pictures import Card, flat, paste
 

@@ -12,7 +12,7 @@ import pytest
 from camera_node.commands.detect import Detect
 from camera_node.detection.detector import Detector
 from camera_node.detection.refusals import Reason, RefusedRing, explain
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.simulation.sensor import MILD
 from tests.benchmarks.detector.pictures import Card, expose, flat, grid, paste
 

@@ -6,7 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from camera_node.detection.detector import Detector
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from tests.camera_node.rendering import Disc, expose, render
 
 

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.outline import centre_shifts, half_axes_of
 from camera_node.geometry.pose import look_at, rotation_from_vector

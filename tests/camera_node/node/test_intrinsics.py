@@ -10,10 +10,10 @@ import pytest
 from calib.rig.camera import Camera
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
-from camera_node.arrays import Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.known_lens import KnownLens
 from camera_node.detection.roundels import DetectedRoundels
+from camera_node.foundation.arrays import Grey
 from camera_node.node.intrinsics import RigLens
 from camera_node.node.node import Node
 from camera_node.protocol.messages import Detections, Keys, decode, encode

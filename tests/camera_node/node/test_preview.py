@@ -16,7 +16,7 @@ from camera_node.commands.adjust import CameraConnection, ChangeSettings, SaveSn
 from camera_node.commands.publish import open_source
 from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import GREEN, draw_preview
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.node.node import Node
 from camera_node.node.preview import MAX_SHARE, PreviewPublisher, encode_preview
 from camera_node.protocol.camera_requests import mask_of, next_detections, request_settings

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.connection import ServerConnection
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.requests import send_request
 from camera_node.protocol.session import (
     BURST_BUFFER,

@@ -7,9 +7,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array
 from camera_node.detection.detector import Detector
 from camera_node.detection.disc_pose import locate
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.sensor_model.imaging import Imaging
 from camera_node.sensor_model.operational_space import (

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
-from camera_node.arrays import Array
-from camera_node.errors import ConfigError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import load_lens
 from camera_node.geometry.pose import invert

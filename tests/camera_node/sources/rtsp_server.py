@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera_node.arrays import Grey
+from camera_node.foundation.arrays import Grey
 from tests.conftest import free_port
 from tests.waiting import wait_for_port
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.frame import SourceSettings, parse_controls
 from camera_node.sources.live import LiveSource

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from camera_node.detection.roundels import Roundels
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.protocol.messages import Detections
 from camera_node.sources.observations import detect_frames, read_observations, write_observations
 

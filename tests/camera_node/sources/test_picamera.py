@@ -11,7 +11,7 @@ import pytest
 
 from camera_node.clocks.host_clock import unix_ahead_ns
 from camera_node.commands.publish import open_source
-from camera_node.errors import CameraAbsentError, ConfigError
+from camera_node.foundation.errors import CameraAbsentError, ConfigError
 from camera_node.sources import picamera
 from camera_node.sources.frame import Frame, SourceSettings
 from camera_node.sources.identity import identify

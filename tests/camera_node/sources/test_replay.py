@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from camera_node.commands.publish import open_source
-from camera_node.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.sources.frame import Frame, SourceSettings
 from camera_node.sources.replay import FrameFolder, VideoFile, read_grey
 

@@ -11,7 +11,7 @@ import pytest
 
 from camera_node.clocks.arrival_clock import LEAST_US, UNKNOWN_US, ArrivalClock
 from camera_node.commands.publish import open_source
-from camera_node.errors import CameraAbsentError, ConfigError
+from camera_node.foundation.errors import CameraAbsentError, ConfigError
 from camera_node.sources.frame import SourceSettings
 from camera_node.sources.stream import open_stream
 from fusion.model.frames import clock_sigma_s

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from camera_node.errors import CameraError
+from camera_node.foundation.errors import CameraError
 from camera_node.protocol.messages import ControlValue
 from camera_node.sources.controls import Control
 from camera_node.sources.frame import Frame

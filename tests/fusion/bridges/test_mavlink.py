@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz, wxyz_from_rotation
 from fusion.bridges.mavlink import MavlinkVehicle, RateDivider, ResetCounter
 from fusion.bridges.mavlink_frames import FrdFrames, roll_pitch_yaw

@@ -16,7 +16,7 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh.ext import Int64, z_deserialize
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from camera_node.protocol.session import listening_endpoints, open_router
 from fusion.bridges.body_motion import covariances, rotations, twists

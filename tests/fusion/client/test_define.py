@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from fusion.commands.define import define
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_router
 from fusion.client import Arena

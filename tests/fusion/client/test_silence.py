@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.connection import ServerConnection
 from fusion.client.silence import cause_of_silence
 from fusion.client.streams import RobotStream

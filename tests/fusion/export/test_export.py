@@ -15,7 +15,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from calib.rig.recording import RecordingWriter
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_wxyz
 from camera_node.protocol.messages import encode
 from fusion.commands.export import export

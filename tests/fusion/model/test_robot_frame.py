@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from fusion.commands.robots import robots
 from fusion.errors import FusionError
 from fusion.model.robot_frame import DECIMALS, MAX_PIVOT_M, move_origin, turn_heading

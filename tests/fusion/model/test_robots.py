@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector
 from fusion.errors import FusionError
 from fusion.model.robots import (

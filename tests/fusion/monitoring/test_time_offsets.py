@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from camera_node.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index
 from fusion.monitoring.clocks.time_offsets import FREE, OffsetEquations
 
 CAMERAS, BODIES, K = 5, 7, len(FREE)

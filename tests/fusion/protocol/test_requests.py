@@ -10,7 +10,7 @@ import msgspec
 import pytest
 import zenoh
 
-from camera_node.errors import NetworkError
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import decode, encode
 from camera_node.protocol.session import open_client, open_router
 from fusion.client.define import LOST_AT_RESTART

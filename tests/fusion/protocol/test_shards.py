@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import MessageError, decode, encode
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits

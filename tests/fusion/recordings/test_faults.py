@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 
 from calib.rig.recording import MAX_LOST, MIN_CHUNK, RecordingWriter, read_messages
 from calib.rig.recording_repair import repair_recording
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from fusion.commands.repair import repair
 from fusion.recordings.record import read_recording
 from tests.conftest import ROOT

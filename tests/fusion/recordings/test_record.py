@@ -12,7 +12,7 @@ import pytest
 from calib.rig.messages import RigMessage
 from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
 from fusion.commands.record import record

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.faults.memory import MAX_MB_PER_MIN, SAMPLE_S, WARM_UP_S, growth
 
 FILLED_MB, BUFFER_MB, NOISE_MB = 40.0, 20.0, 0.2

@@ -16,7 +16,7 @@ import zenoh
 
 from calib.live.rig_requests import set_rig
 from calib.rig.rig import Rig, load_rig, save_rig
-from camera_node.config import dump_yaml
+from camera_node.foundation.config import dump_yaml
 from camera_node.protocol.messages import Detections, decode, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import ClockReply, decode, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits

@@ -12,8 +12,8 @@ import pytest
 from msgspec.structs import replace
 
 from calib.rig.rig import Rig
+from camera_node.foundation.supervisor import Supervisor, log_path
 from camera_node.geometry.pose import Pose
-from camera_node.processes.supervisor import Supervisor, log_path
 from camera_node.simulation.scene import Scene
 from tests.conftest import free_port
 from tests.waiting import wait_for
@@ -49,7 +49,7 @@ def test_leaving_the_block_stops_all_programs(
     supervisor: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Both a program that ends at SIGTERM and one that ignores it; until then their use of resources is measured."""
-    monkeypatch.setattr("camera_node.processes.supervisor.GRACE_S", 0.3)
+    monkeypatch.setattr("camera_node.foundation.supervisor.GRACE_S", 0.3)
     with supervisor:
         for name in ("lasting", "stubborn"):
             supervisor.start(name, name, [])

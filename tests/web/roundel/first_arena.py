@@ -27,8 +27,8 @@ import yaml
 from playwright.sync_api import Locator, Page, expect, sync_playwright
 
 from calib.rig.rig import load_rig
-from camera_node.arrays import Array, Grey
-from camera_node.config import example_file
+from camera_node.foundation.arrays import Array, Grey
+from camera_node.foundation.config import example_file
 from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
 from camera_node.sources.replay import read_grey

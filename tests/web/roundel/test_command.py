@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from web.roundel.command import COMMANDS, execute
 
 MAIN = "from web.roundel.command import main; main()"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import viser
 
-from camera_node.arrays import Array
-from camera_node.config import example_file
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import example_file
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from fusion.model.robots import Robot, load_robots
 from fusion.protocol.messages import Markers, RobotPose

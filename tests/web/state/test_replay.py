@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from calib.rig.recording import RecordingWriter
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import encode
 from fusion.commands.trim import trim
 from fusion.model.robots import Robot

@@ -7,7 +7,7 @@ import zenoh
 
 from calib.rig.messages import RigMessage, undo_rig_key
 from calib.rig.rig import Rig
-from camera_node.errors import NetworkError, RoundelError
+from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
 from tests.waiting import wait_for

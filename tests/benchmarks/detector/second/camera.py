@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from camera_node.arrays import Array, Grey
+from camera_node.foundation.arrays import Array, Grey
 
 ELECTRONS = 25.0  # for each of 255 levels
 READ = 1.0  # noise, levels

@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from camera_node.arrays import Array, Grey
 from camera_node.detection.detector import Detector
 from camera_node.detection.disc_pose import locate_all
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
 from camera_node.simulation.sensor import CLEAN, HARSH, MILD, Sensor
 from tests.benchmarks.detector.cameras import FORGET, SIZES, acquainted

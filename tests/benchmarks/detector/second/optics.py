@@ -15,7 +15,7 @@ from statistics import NormalDist
 import numpy as np
 from scipy import fft
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 
 CUT_OFF = 1.95  # cycles per pixel: 0.55 um, f/2.8 and pixels of 3 um
 DIRECTIONS = 12  # of edges, over half a turn

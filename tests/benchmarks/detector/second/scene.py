@@ -10,7 +10,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.second.optics import REACH, Lens, blur, centroid_of
 from tests.benchmarks.detector.second.print_geometry import CARD, INNER, SIZE, Print, coverage
 from tests.benchmarks.detector.second.surroundings import (

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from camera_node.arrays import Array
+from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.second.print_geometry import Print
 
 EVEN = 0.42  # albedo of the even ground

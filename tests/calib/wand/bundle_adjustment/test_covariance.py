@@ -11,8 +11,8 @@ from calib.commands.check import split_halves
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
 from calib.wand.result import WandCalibration
-from camera_node.arrays import Array
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.recordings import WandScenario

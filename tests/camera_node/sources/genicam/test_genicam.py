@@ -18,7 +18,7 @@ import pytest
 
 from camera_node.clocks.host_clock import unix_ahead_ns
 from camera_node.commands.publish import open_source
-from camera_node.errors import CameraAbsentError, CameraError, ConfigError
+from camera_node.foundation.errors import CameraAbsentError, CameraError, ConfigError
 from camera_node.sources.frame import Frame, Source, SourceSettings
 from camera_node.sources.genicam.source import list_genicam
 from camera_node.sources.identity import identify

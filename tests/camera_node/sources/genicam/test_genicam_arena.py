@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from camera_node.arrays import Array
 from camera_node.clocks.host_clock import unix_ahead_ns
 from camera_node.commands.publish import open_source
+from camera_node.foundation.arrays import Array
 from camera_node.simulation.scene import Scene
 from camera_node.sources.frame import Source, SourceSettings
 from tests.camera_node.sources.genicam.fake_gige import FakeCamera, monotonic_of, stamp_in

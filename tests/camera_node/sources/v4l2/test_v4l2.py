@@ -24,7 +24,7 @@ import json, sys, time
 from itertools import islice
 from pathlib import Path
 import msgspec
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 from camera_node.sources.frame import SourceSettings
 from camera_node.sources.v4l2.devices import describe
 from camera_node.sources.v4l2.source import open_v4l2

@@ -12,7 +12,7 @@ import pytest
 
 from calib.live.rig_requests import redo_rig, set_rig, undo_rig
 from calib.rig.rig import Rig
-from camera_node.errors import RoundelError
+from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.protocol.messages import RobotsRequest
 from fusion.protocol.requests import change_robots

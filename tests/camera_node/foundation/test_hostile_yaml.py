@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.yaml_file import MAX_BYTES, MAX_DEPTH, MAX_VALUES
+from camera_node.foundation.yaml_file import MAX_BYTES, MAX_DEPTH, MAX_VALUES
 
 READ = """
 import resource, sys
 from pathlib import Path
-from camera_node.config import load_yaml
-from camera_node.processes.program import run
+from camera_node.foundation.config import load_yaml
+from camera_node.foundation.program import run
 from camera_node.geometry.body import Body
 resource.setrlimit(resource.RLIMIT_AS, (1 << 31, 1 << 31))
 run(lambda: print(load_yaml(Path(sys.argv[1]), Body)))

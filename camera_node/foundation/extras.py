@@ -4,7 +4,7 @@
 from importlib import import_module
 from typing import Any
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 
 def require(module: str, extra: str, purpose: str) -> Any:

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from camera_node.errors import RoundelError
-from camera_node.processes.allocator import return_freed_memory
-from camera_node.text import printable
+from camera_node.foundation.allocator import return_freed_memory
+from camera_node.foundation.errors import RoundelError
+from camera_node.foundation.text import printable
 
 
 def run(program: Callable[[], int | None]) -> NoReturn:

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from camera_node.errors import USER_ERROR
+from camera_node.foundation.errors import USER_ERROR
 
 log = logging.getLogger("roundel")
 
-GRACE_S = 6.0  # between SIGTERM and SIGKILL; camera_node.processes.child ends its program after 5 s
+GRACE_S = 6.0  # between SIGTERM and SIGKILL; camera_node.foundation.child ends its program after 5 s
 FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 30.0  # before a program is started again; doubles with each failure
 STEADY_S = 60.0  # a program that ran for this long starts with the first delay again
 # One thread per program: on few cores, threads of linear algebra libraries take time from the cameras.
@@ -137,7 +137,7 @@ def spawn(
         folder: in which it runs; that of this process unless given.
     """
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "camera_node.processes.child", module, *arguments],
+        [sys.executable, "-P", "-m", "camera_node.foundation.child", module, *arguments],
         cwd=folder,
         stdin=subprocess.PIPE,
         stdout=output,

@@ -4,7 +4,7 @@
 import pytest
 from rich.table import Table
 
-from camera_node.terminal import console, say, track
+from camera_node.foundation.terminal import console, say, track
 
 LONG = "a/path/of/many/folders/" * 20
 

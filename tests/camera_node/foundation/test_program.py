@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from camera_node.processes.allocator import glibc
+from camera_node.foundation.allocator import glibc
 
 DEADLINE_S = 60.0
 
 RESIDENT = """
 import ctypes, os, threading, time
-from camera_node.processes.allocator import glibc, return_freed_memory
+from camera_node.foundation.allocator import glibc, return_freed_memory
 from tests.benchmarks.faults.memory import anonymous_mb
 
 return_freed_memory(period_s=0.05)
@@ -64,8 +64,8 @@ report(before, 18)
 # An end with a thread that would be in the middle of its work, a log line, and output without a line feed.
 ENDS = """
 import logging, sys, threading
-from camera_node.errors import ConfigError
-from camera_node.processes.program import run
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.program import run
 
 def work():
     while True:

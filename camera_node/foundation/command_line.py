@@ -12,7 +12,7 @@ from typing import Any
 
 import tyro
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 EDGE = re.compile(r"^[│╭╰]\s?|\s*[│╮╯]$", re.MULTILINE)  # of the boxes that tyro prints
 RULE = re.compile(r"\n\s*─+\s*\n")

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from camera_node.line_limits import MAX_KINDS, LineLimiter, LogLimits
-from camera_node.logs import LimitedHandler, LineFormatter, about
+from camera_node.foundation.line_limits import MAX_KINDS, LineLimiter, LogLimits
+from camera_node.foundation.logs import LimitedHandler, LineFormatter, about
 from tests.waiting import wait_for
 
 FUZZED_S = 1020.0  # of a million fuzzed messages
@@ -23,7 +23,7 @@ FAST = LogLimits(pause_s=0.05)
 RECORD = {"name": "tested", "levelno": logging.WARNING, "levelname": "WARNING"}
 FLOOD = """
 import logging, sys
-from camera_node.logs import set_up_logging
+from camera_node.foundation.logs import set_up_logging
 set_up_logging()
 log = logging.getLogger("fusion")
 for k in range(85_804):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Runs a program as a child that ends with its parent: `python -m camera_node.processes.child MODULE ARGUMENTS`.
+"""Runs a program as a child that ends with its parent: `python -m camera_node.foundation.child MODULE ARGUMENTS`.
 
 The parent holds the other end of standard input. The operating system closes it when the parent ends, even by SIGKILL.
 """

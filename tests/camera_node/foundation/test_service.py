@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.service import StopEvent
+from camera_node.foundation.service import StopEvent
 from tests.conftest import ROOT
 from tests.processes import running
 from tests.waiting import DEADLINE_S
@@ -18,7 +18,7 @@ from tests.waiting import DEADLINE_S
 # A signal that arrives while the event's own lock is held, as in `Event.wait`.
 IN_WAIT = """
 import os, signal, sys
-from camera_node.service import stopped_by_signals
+from camera_node.foundation.service import stopped_by_signals
 with stopped_by_signals() as stop:
     with stop._cond:
         os.kill(os.getpid(), int(sys.argv[1]))
@@ -27,7 +27,7 @@ with stopped_by_signals() as stop:
 # The second signal finds the handlers of before.
 AFTERWARDS = """
 import os, signal, sys
-from camera_node.service import stopped_by_signals
+from camera_node.foundation.service import stopped_by_signals
 number = int(sys.argv[1])
 for _ in range(3):
     with stopped_by_signals() as stop:

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from camera_node.config import load_yaml, write_atomically
-from camera_node.errors import ConfigError
+from camera_node.foundation.config import load_yaml, write_atomically
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from camera_node.errors import ConfigError
+from camera_node.foundation.errors import ConfigError
 
 MAX_BYTES = 1 << 20  # 64 cameras with covariances take a tenth of it
 MAX_DEPTH = 32  # nested lists and mappings; no file of this project has more than 6

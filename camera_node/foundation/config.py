@@ -12,9 +12,9 @@ import msgspec
 import numpy as np
 import yaml
 
-from camera_node.errors import ConfigError
-from camera_node.text import printable
-from camera_node.yaml_file import read_yaml
+from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.text import printable
+from camera_node.foundation.yaml_file import read_yaml
 
 T = TypeVar("T")
 NAME = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
