@@ -5,30 +5,14 @@ import ast
 import os
 import subprocess
 import sys
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
-from functools import cache
-from pathlib import Path
+from collections import defaultdict
+from collections.abc import Iterable
 
 import pytest
 
-from tests.conftest import ROOT
+from tests.source_tree import PROGRAMS, imports, name_of, parse, python_files
 
-PROGRAMS = ("camera_node", "calib", "fusion", "web")
-MAX_PARAMETERS = 6
-MAX_MODULES = 14  # of one folder
 COMMON_TYPES = {"Array", "Index", "Mask", "Grey"}  # camera_node/foundation/arrays.py defines them
-
-# Commands of the command line: tyro turns each parameter into an option, so a function may have more of them.
-COMMANDS = {"define", "record", "ros2", "run"}
-
-
-def sources(*folders: str) -> list[Path]:
-    return [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
-
-
-def name_of(path: Path) -> str:
-    return path.relative_to(ROOT).as_posix()
 
 
 def assert_none(violations: Iterable[str]) -> None:
@@ -37,72 +21,21 @@ def assert_none(violations: Iterable[str]) -> None:
     assert not lines, "\n".join(["", *lines])
 
 
-@cache
-def parse(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(), path)
-
-
-def functions(path: Path) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    """All functions and methods of a module, with their qualified names."""
-
-    def visit(node: ast.AST, prefix: str) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-        for child in ast.iter_child_nodes(node):
-            inner = prefix
-            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
-                yield prefix + child.name, child
-            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-                inner = f"{prefix}{child.name}."
-            yield from visit(child, inner)
-
-    return visit(parse(path), "")
-
-
-def imports(path: Path) -> set[str]:
-    """The modules that a file imports; of `from a import b` both a and a.b, since b may be a module."""
-    found: set[str] = set()
-    for node in ast.walk(parse(path)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return found
-
-
 def test_a_public_class_name_has_one_meaning():
     """Stubs of the native modules (.pyi) do not count: a Python class may wrap a native one of the same name."""
     modules = defaultdict(list)
-    for path in sources(*PROGRAMS):
+    for path in python_files(*PROGRAMS):
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 modules[node.name].append(name_of(path))
     assert_none(f"{name}: {', '.join(paths)}" for name, paths in modules.items() if len(paths) > 1)
 
 
-def count_parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """The number of parameters without self and cls."""
-    own = function.args
-    names = [a.arg for a in (*own.posonlyargs, *own.args, own.vararg, *own.kwonlyargs, own.kwarg) if a]
-    return len(names) - (names[:1] in (["self"], ["cls"]))
-
-
-def test_functions_have_at_most_six_parameters():
-    """More become a named structure."""
-    long = {
-        f"{name_of(path)}: {name}": count
-        for path in sources(*PROGRAMS)
-        for name, function in functions(path)
-        if (count := count_parameters(function)) > MAX_PARAMETERS
-    }
-    commands = {place for place in long if place.split(": ")[1] in COMMANDS}
-    assert_none(f"{place} has {count} parameters" for place, count in long.items() if place not in commands)
-    assert len(commands) == len(COMMANDS), "COMMANDS lists a function that does not need the exception"
-
-
 def test_no_constructor_receives_the_object_that_calls_it():
     """A part receives what it needs, not its owner."""
     assert_none(
         f"{name_of(path)}:{node.lineno}: {ast.unparse(node)[:60]}"
-        for path in sources(*PROGRAMS)
+        for path in python_files(*PROGRAMS)
         for node in ast.walk(parse(path))
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
@@ -112,7 +45,9 @@ def test_no_constructor_receives_the_object_that_calls_it():
 
 
 def test_program_code_imports_no_tests():
-    assert_none(name_of(p) for p in sources(*PROGRAMS) if any(m.split(".")[0] == "tests" for m in imports(p)))
+    assert_none(
+        name_of(p) for p in python_files(*PROGRAMS) if any(m.split(".")[0] == "tests" for m in imports(p))
+    )
 
 
 def test_tests_import_helpers_only():
@@ -124,23 +59,18 @@ def test_tests_import_helpers_only():
             "conftest" not in folders or folders[:2] == ["tests", "conftest"]
         )
 
-    modules = {name_of(path)[: -len(".py")].replace("/", ".") for path in sources("tests")}
+    modules = {name_of(path)[: -len(".py")].replace("/", ".") for path in python_files("tests")}
     assert_none(
         f"{name_of(path)} imports {module}"
-        for path in sources("tests")
+        for path in python_files("tests")
         for module in imports(path) & modules
         if not is_helper(module)
     )
 
 
-def test_folders_have_at_most_fourteen_modules():
-    counts = Counter(name_of(path.parent) for path in sources(*PROGRAMS) if path.name != "__init__.py")
-    assert_none(f"{f} has {count}" for f, count in counts.items() if count > MAX_MODULES)
-
-
 def test_array_types_are_defined_once():
     """In camera_node/foundation/arrays.py, which is also the only module that writes NDArray[np.float64]."""
-    for path in sources(*PROGRAMS, "tests"):
+    for path in python_files(*PROGRAMS, "tests"):
         nodes = list(ast.walk(parse(path)))
         targets = [t for node in nodes if isinstance(node, ast.Assign) for t in node.targets]
         names = {target.id for target in targets if isinstance(target, ast.Name)}
