@@ -12,7 +12,7 @@ from camera_node.commands.camera import LocalCameras, given_options
 from camera_node.foundation.errors import NetworkError
 from camera_node.foundation.supervisor import Supervisor
 from camera_node.sources.frame import SourceSettings
-from fusion.server.config import ArenaConfig
+from fusion.server.arena_config import ArenaConfig
 from web.arena_folder import ArenaFolder
 from web.page_access import PageAccess, is_loopback
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from fusion.protocol.messages import FusionStatus
+from fusion.protocol.pose_messages import FusionStatus
 from web.state.feed import ArenaState
 from web.tables import STALE_S, camera_silence_s, describe_silence, tabulate_cameras, tabulate_robots
 

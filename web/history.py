@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from camera_node.foundation.arrays import Array
-from fusion.protocol.messages import FusionStatus
+from fusion.protocol.pose_messages import FusionStatus
 from web.condition import Condition
 from web.state.feed import ArenaState
 

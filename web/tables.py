@@ -6,7 +6,7 @@ from collections import Counter
 import numpy as np
 
 from camera_node.geometry.pose import rotation_from_wxyz
-from fusion.protocol.messages import CameraHealth, FusionStatus, Latency, RobotPose
+from fusion.protocol.pose_messages import CameraHealth, FusionStatus, Latency, RobotPose
 from web.colours import css, robot_colour
 from web.html_tables import Column, HtmlTable, TableRow
 from web.state.feed import ArenaState

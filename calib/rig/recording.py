@@ -2,7 +2,7 @@
 """Reads and writes recordings: MCAP files of messages as they arrived, one channel per Zenoh key.
 
 Messages are in MessagePack as on the wire. `log_time` is the time of arrival, in the recorder's clock. The other
-messages of an arena's recording are defined by fusion (`fusion.recordings.record`).
+messages of an arena's recording are defined by fusion (`fusion.recordings.arena_recording`).
 """
 
 import io

@@ -7,7 +7,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import rotation_from_wxyz, skew
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 
 
 def rotations(poses: Sequence[RobotPose]) -> Array:

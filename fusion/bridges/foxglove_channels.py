@@ -14,7 +14,7 @@ from camera_node.foundation.extras import require
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from camera_node.protocol.messages import Preview
 from fusion.model.robots import Robot
-from fusion.protocol.messages import Markers, RobotPose, Vector
+from fusion.protocol.pose_messages import Markers, RobotPose, Vector
 
 WORLD = "world"
 THICKNESS_M = 0.002  # of a drawn roundel

@@ -14,7 +14,7 @@ import numpy as np
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.errors import ConfigError
 from fusion.bridges.body_motion import covariances, rotations, twists
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # turns forward, left, up to forward, right, down
 MIN_COS_PITCH = (

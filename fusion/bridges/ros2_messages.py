@@ -16,7 +16,7 @@ from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
 from camera_node.protocol.relative import RelativePositions
 from fusion.bridges.body_motion import covariances, rotations, twists
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 
 # ROS 2 name of a message -> hash of its definition (REP 2016), the same in all releases since Iron
 TYPE_HASHES = {

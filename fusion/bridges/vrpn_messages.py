@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 
 COOKIE = b"vrpn: ver. 07.35  0".ljust(24, b"\0")  # the digit: the server is not to write a log
 COOKIE_START = b"vrpn: ver. 07."

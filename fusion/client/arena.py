@@ -37,8 +37,8 @@ from camera_node.protocol.server_address import LOCAL
 from camera_node.protocol.session import ask_server
 from fusion.client.streams import RelativeStream, RobotStream, Stream
 from fusion.model.robots import Robot as RobotBody
-from fusion.protocol.messages import FusionStatus, Markers, RobotPose, RobotPoses, Robots, RobotsRequest
-from fusion.protocol.requests import change_robots, request_robots
+from fusion.protocol.pose_messages import FusionStatus, Markers, RobotPose, RobotPoses, Robots, RobotsRequest
+from fusion.protocol.robot_requests import change_robots, request_robots
 
 TIMEOUT_S = 10.0
 MAX_ROBOTS = 1024

@@ -13,8 +13,8 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.requests import RequestSource
 from fusion.client.measure import collect_markers, find_stationary_markers, robot_from_markers
 from fusion.model.likeness import distances
-from fusion.protocol.messages import Robots, RobotsRequest
-from fusion.protocol.requests import change_robots, request_robots
+from fusion.protocol.pose_messages import Robots, RobotsRequest
+from fusion.protocol.robot_requests import change_robots, request_robots
 
 LOST_AT_RESTART = "a restart of the server loses it, because arena.yaml names no saved_robots"
 

@@ -20,7 +20,7 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.protocol.messages import Keys, MessageError, decode
 from fusion.errors import FusionError
 from fusion.model.robots import MotionModel, Robot
-from fusion.protocol.messages import Markers
+from fusion.protocol.pose_messages import Markers
 
 SAME_M = 0.02  # the largest distance of one stationary marker's positions in two messages
 STATIONARY_M = 0.005  # the largest median distance of a stationary marker from its median position

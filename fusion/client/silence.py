@@ -10,7 +10,7 @@ from camera_node.foundation.config import is_name
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.discovery import ALIVE
-from fusion.protocol.requests import request_robots
+from fusion.protocol.robot_requests import request_robots
 
 ANSWER_S = 1.0  # longest wait for each answer
 MAX_NAMED = 20  # robots or arenas in one line

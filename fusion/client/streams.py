@@ -14,7 +14,7 @@ from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.relative import RelativePositions
 from fusion.client.silence import NO_SERVER, no_such_robot
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 
 T = TypeVar("T")
 

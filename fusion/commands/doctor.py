@@ -21,7 +21,7 @@ from fusion.diagnosis.machine import (
     check_listening,
     check_versions,
 )
-from fusion.server.config import ArenaConfig, load_arena
+from fusion.server.arena_config import ArenaConfig, load_arena
 
 START = "start it with roundel server --config arena.yaml, or give its address with --connect"
 

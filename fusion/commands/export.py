@@ -6,9 +6,16 @@ from typing import Literal
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
-from fusion.export.files import write_c3d, write_csv, write_foxglove, write_rosbag, write_trc, write_tum
 from fusion.export.points import sample_points
-from fusion.export.poses import RecordedPoses
+from fusion.export.pose_formats import (
+    write_c3d,
+    write_csv,
+    write_foxglove,
+    write_rosbag,
+    write_trc,
+    write_tum,
+)
+from fusion.export.recorded_poses import RecordedPoses
 
 Format = Literal["c3d", "trc", "csv", "tum", "rosbag", "foxglove"]
 FORMATS: dict[str, Format] = {

@@ -11,7 +11,7 @@ import tyro
 
 from camera_node.foundation.terminal import say
 from fusion.client.arena import Arena
-from fusion.protocol.health import assess_health
+from fusion.protocol.arena_health import assess_health
 
 HEALTHY, ATTENTION = 0, 1  # exit codes; 2 where no server answers
 

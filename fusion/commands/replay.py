@@ -6,8 +6,8 @@ from pathlib import Path
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say, track
 from fusion.model.limits import Limits
+from fusion.recordings.arena_recording import read_recording
 from fusion.recordings.frame_sets import recorded_frame_sets
-from fusion.recordings.record import read_recording
 from fusion.recordings.replay import cameras_of, robots_of, write_recording
 from fusion.recordings.report import Summary, write_poses
 from fusion.recordings.run import OfflineArena, fuse_frame_sets, fuse_recording

@@ -15,8 +15,8 @@ from camera_node.protocol.session import open_client
 from fusion.client.define import LOST_AT_RESTART
 from fusion.model.robot_frame import move_origin, turn_heading
 from fusion.model.robots import Robot, save_robots
-from fusion.protocol.messages import Robots, RobotsRequest
-from fusion.protocol.requests import change_robots, reframe_robot, request_robots
+from fusion.protocol.pose_messages import Robots, RobotsRequest
+from fusion.protocol.robot_requests import change_robots, reframe_robot, request_robots
 
 USES = {
     "list": "",

@@ -39,7 +39,7 @@ class Serve:
 
     def run(self) -> int:
         """Serve until Ctrl-C or SIGTERM."""
-        from fusion.server.config import (  # not at the top: --help needs no GTSAM
+        from fusion.server.arena_config import (  # not at the top: --help needs no GTSAM
             ArenaConfig,
             load_arena,
             override,

@@ -12,8 +12,8 @@ from camera_node.protocol.messages import CameraStatus
 from fusion.client.arena import Arena
 from fusion.diagnosis.findings import Finding
 from fusion.diagnosis.machine import check_rig
-from fusion.protocol.health import camera_problems
-from fusion.protocol.messages import FusionStatus
+from fusion.protocol.arena_health import camera_problems
+from fusion.protocol.pose_messages import FusionStatus
 
 LISTEN_S = 2.5  # at least two statuses of every camera
 MAX_CAMERAS = 256

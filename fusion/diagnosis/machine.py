@@ -19,8 +19,8 @@ from calib.rig.rig import Rig, load_rig
 from camera_node.foundation.errors import RoundelError
 from fusion.diagnosis.findings import Finding
 from fusion.model.robots import load_robots
-from fusion.protocol.health import assess_calibration, calibration_problems, describe_calibration
-from fusion.server.config import ArenaConfig
+from fusion.protocol.arena_health import assess_calibration, calibration_problems, describe_calibration
+from fusion.server.arena_config import ArenaConfig
 
 PACKAGES = ("roundel", "eclipse-zenoh", "numpy", "opencv-python-headless", "gtsam", "scipy", "mcap", "viser")
 CERTIFICATES = ("root_ca_certificate", "listen_certificate", "connect_certificate")

@@ -13,7 +13,7 @@ import numpy as np
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_wxyz
-from fusion.export.poses import RecordedPoses
+from fusion.export.recorded_poses import RecordedPoses
 
 MAX_VALUES = 100_000_000  # coordinates of one file
 GAP = 2.5  # periods of the poses that may be between two of them; a longer gap has no points

@@ -15,7 +15,7 @@ from camera_node.foundation.arrays import Index
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz, wxyz_from_rotation
 from fusion.model.states import States
-from fusion.protocol.messages import ShardPoses, TrackingState
+from fusion.protocol.pose_messages import ShardPoses, TrackingState
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from dataclasses import replace
 from calib.rig.camera import Camera
 from camera_node.protocol.messages import Detections
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.protocol.messages import FusedFrames
-from fusion.recordings.record import ArenaRecording
+from fusion.protocol.pose_messages import FusedFrames
+from fusion.recordings.arena_recording import ArenaRecording
 from fusion.server.ingest import sanitized
 
 

@@ -11,7 +11,7 @@ from calib.rig.rig import load_rig
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Keys, encode
 from fusion.model.robots import Robot, load_robots
-from fusion.recordings.record import ArenaRecording
+from fusion.recordings.arena_recording import ArenaRecording
 from fusion.tracking.result import TrackingResult
 
 

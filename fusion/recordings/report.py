@@ -12,7 +12,7 @@ import numpy as np
 
 from camera_node.foundation.config import write_atomically
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult
 
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"

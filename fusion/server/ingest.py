@@ -14,7 +14,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from camera_node.protocol.publishers import Publishers
 from fusion.model.frames import CalibratedFrame
-from fusion.server.status import ServerStatistics
+from fusion.server.server_statistics import ServerStatistics
 
 MAX_AGE_NS = 5_000_000_000  # a capture time older than this is implausible
 MAX_AHEAD_NS = 2_000_000_000  # as is one so far in the future; `CameraClocks` corrects or refuses the others

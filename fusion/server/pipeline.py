@@ -16,9 +16,9 @@ from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import Robot, changed, load_robots, load_saved_robots, save_robots
 from fusion.monitoring.clocks.camera_clocks import ClockHealth
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
-from fusion.protocol.messages import RobotsRequest, ShardPoses
+from fusion.protocol.pose_messages import RobotsRequest, ShardPoses
 from fusion.protocol.shards import Shard
-from fusion.server.config import ArenaConfig
+from fusion.server.arena_config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.storage.active_rig import ActiveRig
 from fusion.server.storage.persistence import PersistedFile

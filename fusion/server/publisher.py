@@ -9,7 +9,7 @@ from calib.rig.messages import RigMessage
 from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.registration import CameraAssignment, assigned_key
 from fusion.model.frames import FrameSet
-from fusion.protocol.messages import (
+from fusion.protocol.pose_messages import (
     FusedFrames,
     FusionStatus,
     Latency,

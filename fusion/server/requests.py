@@ -28,7 +28,7 @@ from camera_node.protocol.requests import (
     payload_of,
 )
 from fusion.model.undistortion import prepare_lenses
-from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
+from fusion.protocol.pose_messages import Robots, RobotsRequest, robots_key, set_robots_key
 from fusion.server.pipeline import TrackingPipeline
 from fusion.server.publisher import ArenaPublisher
 from fusion.server.server_clock import ServerClock

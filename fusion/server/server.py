@@ -21,11 +21,11 @@ from fusion.errors import FusionError
 from fusion.model.frames import FrameSet
 from fusion.model.undistortion import prepare_lenses
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
-from fusion.protocol.health import describe_status
-from fusion.protocol.messages import FusionStatus, ShardPoses, TrackingState, shard_key
+from fusion.protocol.arena_health import describe_status
+from fusion.protocol.pose_messages import FusionStatus, ShardPoses, TrackingState, shard_key
 from fusion.protocol.shards import Shard
+from fusion.server.arena_config import ArenaConfig
 from fusion.server.camera_requests import CameraRequests
-from fusion.server.config import ArenaConfig
 from fusion.server.frame_quotas import FrameQuotas
 from fusion.server.frame_synchronizer import MAX_RATE_HZ
 from fusion.server.ingest import MAX_AGE_NS, Ingest
@@ -33,7 +33,7 @@ from fusion.server.pipeline import TrackingPipeline
 from fusion.server.publisher import ArenaPublisher
 from fusion.server.requests import RequestHandlers
 from fusion.server.server_clock import clock_of
-from fusion.server.status import PipelineStatus, ServerStatistics
+from fusion.server.server_statistics import PipelineStatus, ServerStatistics
 from fusion.server.storage.audit import AuditLog
 from fusion.server.storage.camera_registry import CameraRegistry
 from fusion.server.transport import INTERNAL_ERROR, Transport, open_session

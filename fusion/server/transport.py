@@ -20,7 +20,7 @@ from camera_node.protocol.messages import encode
 from camera_node.protocol.requests import REQUEST_S, payload_of, respond
 from camera_node.protocol.session import has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
-from fusion.server.config import ArenaConfig
+from fusion.server.arena_config import ArenaConfig
 from fusion.server.frame_quotas import FrameQuotas
 from fusion.server.preparation import Preparation
 from fusion.server.server_clock import ServerClock

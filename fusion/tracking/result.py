@@ -15,7 +15,7 @@ from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet
 from fusion.model.observations import Assignments, DetectionTable, MarkerTable
 from fusion.model.states import POSITION, States
-from fusion.protocol.messages import Latency, Markers, RobotPose
+from fusion.protocol.pose_messages import Latency, Markers, RobotPose
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.track_table import TrackTable

@@ -10,7 +10,7 @@ from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, MarkerTable
 from fusion.model.robots import Robot
 from fusion.model.states import POSITION, THETA, States
-from fusion.protocol.messages import ShardPoses, TrackingState
+from fusion.protocol.pose_messages import ShardPoses, TrackingState
 from fusion.protocol.shards import Shard, shard_poses_of, states_of
 from fusion.tracking.gating import START_S, START_SIGMAS
 

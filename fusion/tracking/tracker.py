@@ -18,7 +18,7 @@ from fusion.monitoring.clocks.time_search import Snapshot
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, TrackedScene
 from fusion.monitoring.frame_consistency import AssignedFrames
 from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import AssociatedFrames, Association

@@ -26,7 +26,7 @@ import zenoh
 from camera_node.protocol.messages import Keys
 from camera_node.protocol.session import open_client, open_router
 from fusion.client.arena import Arena
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from fusion.protocol.shards import Shard
 from fusion.server.publisher import ArenaPublisher
 from fusion.server.server_clock import ServerClock

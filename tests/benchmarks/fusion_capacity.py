@@ -22,7 +22,7 @@ import tyro
 from camera_node.foundation.arrays import Array
 from camera_node.protocol.messages import Detections, decode, encode
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.protocol.messages import Latency, RobotPose, ShardPoses
+from fusion.protocol.pose_messages import Latency, RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import collecting_between_frame_sets

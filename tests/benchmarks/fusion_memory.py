@@ -13,7 +13,7 @@ import tyro
 
 from camera_node.protocol.messages import encode
 from fusion.server.server import collecting_between_frame_sets
-from fusion.server.status import memory_mb
+from fusion.server.server_statistics import memory_mb
 from tests.benchmarks.fusion_capacity import DELAY_NS, Queue, Series
 from tests.benchmarks.fusion_load import START_NS, Load
 

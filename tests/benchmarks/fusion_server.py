@@ -23,7 +23,7 @@ from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena, Stream
-from fusion.protocol.messages import FusionStatus
+from fusion.protocol.pose_messages import FusionStatus
 from tests.benchmarks.fusion_load import START_NS, Load
 from tests.conftest import free_port
 

@@ -32,7 +32,7 @@ from websockets.sync.client import connect
 from camera_node.protocol.messages import CameraStatus, Keys, Preview, decode, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena
-from fusion.protocol.messages import RobotPoses
+from fusion.protocol.pose_messages import RobotPoses
 from tests.benchmarks.fusion_load import LENS, Load
 from tests.benchmarks.fusion_server import ARENA, DEADLINE_S, publish, serving
 from tests.conftest import free_port

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from fusion.model.limits import Limits
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from fusion.tracking.result import TrackingResult
 from tests.fusion.synthetic import Arena
 from tests.fusion.tracks import poses_of, track

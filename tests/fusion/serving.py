@@ -17,7 +17,7 @@ from camera_node.foundation.config import dump_yaml
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits
-from fusion.server.config import ArenaConfig
+from fusion.server.arena_config import ArenaConfig
 from fusion.server.server import Server
 from tests.conftest import ROOT
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, line

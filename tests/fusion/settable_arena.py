@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fusion.client.arena import Arena as Client
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from tests.conftest import ROOT
 from tests.fusion.moving_cameras import MOVING
 from tests.fusion.serving import DEADLINE_S, config

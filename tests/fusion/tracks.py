@@ -6,7 +6,7 @@ import numpy as np
 from camera_node.geometry.pose import rotation_from_wxyz
 from fusion.model.frames import CalibratedFrame
 from fusion.model.limits import Limits
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.result import TrackingResult
 from fusion.tracking.tracker import Tracker

@@ -18,7 +18,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import COLUMNS, MAX_ROUNDELS, Detections, Keys, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
-from fusion.protocol.messages import FusionStatus, RobotPose
+from fusion.protocol.pose_messages import FusionStatus, RobotPose
 from tests.fusion.serving import ARENA
 from tests.processes import running
 from tests.waiting import Inbox, wait_for

@@ -16,8 +16,8 @@ from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import ClockReply, encode
 from camera_node.protocol.session import listening_endpoints, open_client, open_router
 from fusion.client.arena import Arena
-from fusion.protocol.messages import Robots, robots_key
-from fusion.protocol.requests import request_robots
+from fusion.protocol.pose_messages import Robots, robots_key
+from fusion.protocol.robot_requests import request_robots
 from tests.fusion.serving import KEYS, config, serving
 from tests.waiting import DEADLINE_S, wait_for
 from tests.web.arena import four_cameras

@@ -16,8 +16,8 @@ from camera_node.node.intrinsics import RigLens
 from camera_node.protocol.messages import Detections, Roundels, encode
 from camera_node.protocol.requests import RequestError
 from fusion.client.arena import Arena
-from fusion.protocol.messages import RobotsRequest
-from fusion.protocol.requests import change_robots, request_robots
+from fusion.protocol.pose_messages import RobotsRequest
+from fusion.protocol.robot_requests import change_robots, request_robots
 from tests.security.lab import ARENA, KEYS, Lab, certificates
 from tests.waiting import DEADLINE_S, wait_for
 from tests.web.arena import four_cameras

@@ -13,7 +13,14 @@ from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, encode
 from camera_node.protocol.session import listening_endpoints, open_router
-from fusion.protocol.messages import CameraHealth, FusionStatus, Latency, Markers, RobotPose, TrackingState
+from fusion.protocol.pose_messages import (
+    CameraHealth,
+    FusionStatus,
+    Latency,
+    Markers,
+    RobotPose,
+    TrackingState,
+)
 
 
 class ArenaMessages:

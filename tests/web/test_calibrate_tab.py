@@ -14,7 +14,7 @@ from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
-from fusion.server.config import ArenaConfig
+from fusion.server.arena_config import ArenaConfig
 from tests.calib.synthetic import ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world
 from tests.fusion.serving import serving

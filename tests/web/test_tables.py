@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from camera_node.protocol.messages import CameraStatus
-from fusion.protocol.messages import CameraHealth, FusionStatus
+from fusion.protocol.pose_messages import CameraHealth, FusionStatus
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from web.colours import css, robot_colour

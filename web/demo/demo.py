@@ -26,8 +26,8 @@ from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.session import CONNECT_S
 from camera_node.simulation.scene import Scene
 from camera_node.sources.frame import SourceSettings
-from fusion.protocol.messages import RobotPose
-from fusion.server.config import load_arena
+from fusion.protocol.pose_messages import RobotPose
+from fusion.server.arena_config import load_arena
 from web.arena_folder import ArenaFolder
 from web.arena_programs import CALIBRATION, ArenaPrograms
 from web.demo.failures import ProgramFailed, interrupt_on_signals, quote_end, raise_failure

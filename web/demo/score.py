@@ -8,7 +8,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import rotation_from_wxyz
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 
 MAX_RMS_MM = 5.0  # position error of a demo that passes
 MAX_GAP_S = 0.5  # longest time without a tracked pose of a demo that passes

@@ -18,7 +18,7 @@ from camera_node.foundation.service import ServiceManager, stopped_by_signals
 from camera_node.foundation.supervisor import Supervisor
 from camera_node.foundation.terminal import say
 from camera_node.sources.frame import SourceSettings
-from fusion.server.config import ArenaConfig, load_arena
+from fusion.server.arena_config import ArenaConfig, load_arena
 from web.arena_folder import ArenaFolder
 from web.arena_programs import ArenaPrograms
 from web.view import check_port

@@ -18,7 +18,7 @@ from camera_node.foundation.text import printable
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, Preview, decode
 from camera_node.protocol.relative import RelativePositions
 from fusion.model.robots import Robot
-from fusion.protocol.messages import FusionStatus, Markers, RobotPose, Robots, robots_key
+from fusion.protocol.pose_messages import FusionStatus, Markers, RobotPose, Robots, robots_key
 from web.state.coverage_picture import CoveragePicture
 from web.state.messages import DemoProgress, progress_key
 

@@ -5,7 +5,7 @@ import msgspec
 
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import VERSION, MessageError
-from fusion.protocol.messages import MAX_NUMBER
+from fusion.protocol.pose_messages import MAX_NUMBER
 
 Vector = tuple[float, float, float]
 

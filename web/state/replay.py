@@ -13,7 +13,7 @@ import zenoh
 
 from calib.rig.recording import read_messages
 from camera_node.foundation.errors import ConfigError
-from fusion.protocol.messages import robots_key
+from fusion.protocol.pose_messages import robots_key
 from web.state.feed import Feed
 
 LEAD_S = 2.0  # a jump also replays the messages of so long before it: one status of every program

@@ -20,8 +20,8 @@ from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.requests import RequestSource
 from fusion.client.measure import collect_markers
 from fusion.model.robots import Robot
-from fusion.protocol.messages import FusionStatus, Markers, Robots, RobotsRequest
-from fusion.protocol.requests import change_robots, reframe_robot, request_robots
+from fusion.protocol.pose_messages import FusionStatus, Markers, Robots, RobotsRequest
+from fusion.protocol.robot_requests import change_robots, reframe_robot, request_robots
 from web.state.feed import Feed
 
 REQUEST_TIMEOUT_S = 2.0

@@ -11,7 +11,7 @@ from camera_node.foundation.config import require_name
 from fusion.errors import FusionError
 from fusion.model.robot_frame import move_origin, turn_heading
 from fusion.model.robots import save_robots
-from fusion.protocol.messages import Robots, RobotsRequest
+from fusion.protocol.pose_messages import Robots, RobotsRequest
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tables import tabulate_robots

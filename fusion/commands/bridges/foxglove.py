@@ -3,7 +3,7 @@
 
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
-from fusion.bridges.foxglove import ArenaContent, serving
+from fusion.bridges.foxglove_server import ArenaContent, serving
 from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server
 
 

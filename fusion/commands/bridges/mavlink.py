@@ -10,8 +10,8 @@ from camera_node.foundation.config import require_name
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
 from camera_node.node.clock_sync import ClockSync
-from fusion.bridges.mavlink import MavlinkBridge, MavlinkVehicle, RateDivider
 from fusion.bridges.mavlink_frames import FrdFrames
+from fusion.bridges.mavlink_vehicle import MavlinkBridge, MavlinkVehicle, RateDivider
 from fusion.bridges.pose_queue import LOCAL, Server, log_faults
 
 

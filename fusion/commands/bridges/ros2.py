@@ -8,7 +8,7 @@ from camera_node.foundation.terminal import say
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.session import BURST_BUFFER
 from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server, log_faults
-from fusion.bridges.ros2 import Ros2Node, parse_domain, parse_namespace
+from fusion.bridges.ros2_node import Ros2Node, parse_domain, parse_namespace
 
 
 def ros2(

@@ -4,7 +4,7 @@
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
 from fusion.bridges.pose_queue import LOCAL, Server, log_faults
-from fusion.bridges.vrpn import VrpnServer
+from fusion.bridges.vrpn_server import VrpnServer
 
 
 def vrpn(*, server: Server = LOCAL, host: str = "127.0.0.1", port: int = 3883) -> int:

@@ -13,7 +13,7 @@ import msgspec
 from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
 from fusion.client.arena import Arena as Client
-from fusion.protocol.messages import FusionStatus
+from fusion.protocol.pose_messages import FusionStatus
 from tests.benchmarks.faults.judge import PoseJudge
 from tests.benchmarks.faults.network import Loopback
 from tests.benchmarks.faults.programs import Programs, python

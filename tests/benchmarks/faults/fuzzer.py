@@ -21,7 +21,7 @@ from camera_node.foundation.terminal import say
 from camera_node.protocol.messages import Keys, Settings
 from camera_node.protocol.registration import assigned_key, change_key, register_key, registered_key
 from camera_node.protocol.session import open_client
-from fusion.protocol.messages import RobotsRequest
+from fusion.protocol.pose_messages import RobotsRequest
 from tests.benchmarks.faults.mutation import certainly_invalid, clone, mutate, odd_text
 
 FUZZED = "fuzzed"  # a camera of the rig whose detections are all mutated

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fusion.model.states import POSITION
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from tests.benchmarks.faults.world import Clock, World
 
 MAX_ERROR_M = 0.010  # a tracked pose is wrong if its error is above this and above MAX_SIGMAS

@@ -9,7 +9,7 @@ import numpy as np
 
 from camera_node.clocks.host_clock import unix_ahead_ns
 from fusion.model.states import POSITION
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.judge import MAX_ERROR_M, MAX_SIGMAS
 from tests.benchmarks.faults.world import CameraFault

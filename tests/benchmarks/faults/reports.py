@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fusion.model.limits import Limits
-from fusion.protocol.messages import CameraHealth
+from fusion.protocol.pose_messages import CameraHealth
 from tests.benchmarks.faults.arena import LiveArena
 
 LATENESS_MS = Limits().lateness_ms  # for which the server waits for a frame

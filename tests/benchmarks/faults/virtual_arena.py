@@ -14,8 +14,8 @@ import numpy as np
 
 from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, decode, encode
-from fusion.protocol.messages import FusionStatus, RobotPose
-from fusion.server.config import ArenaConfig
+from fusion.protocol.pose_messages import FusionStatus, RobotPose
+from fusion.server.arena_config import ArenaConfig
 from fusion.server.publisher import ArenaPublisher
 from fusion.server.server import Server
 from tests.benchmarks.faults.camera import SceneCamera, SceneDetector

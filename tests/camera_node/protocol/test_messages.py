@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 import calib.rig.messages
 import camera_node.protocol.messages
 import camera_node.protocol.relative
-import fusion.protocol.messages
+import fusion.protocol.pose_messages
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import (
     MAX_ROUNDELS,
@@ -26,7 +26,7 @@ from camera_node.protocol.messages import (
     decode,
     encode,
 )
-from fusion.protocol.messages import FusionStatus, Markers, RobotPose
+from fusion.protocol.pose_messages import FusionStatus, Markers, RobotPose
 from tests.conftest import ROOT
 
 KINDS = (Detections, CameraStatus, ClockReply, Settings, Markers, RobotPose, FusionStatus)
@@ -139,7 +139,7 @@ def test_every_field_is_documented():
         camera_node.protocol.messages,
         camera_node.protocol.relative,
         calib.rig.messages,
-        fusion.protocol.messages,
+        fusion.protocol.pose_messages,
     ):
         for name, kind in vars(module).items():
             if (

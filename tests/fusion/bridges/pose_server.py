@@ -13,7 +13,7 @@ import zenoh
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
 from camera_node.protocol.messages import ClockReply, Keys, encode
 from camera_node.protocol.session import open_router
-from fusion.protocol.messages import RobotPose, RobotPoses
+from fusion.protocol.pose_messages import RobotPose, RobotPoses
 from tests.processes import running
 from tests.waiting import DEADLINE_S, wait_for
 

@@ -19,9 +19,9 @@ from camera_node.geometry.pose import rotation_from_wxyz
 from camera_node.protocol.messages import Preview, encode
 from camera_node.protocol.session import open_client
 from camera_node.protocol.tcp_sockets import tcp_sockets
-from fusion.bridges.foxglove import serving
+from fusion.bridges.foxglove_server import serving
 from fusion.client.arena import Arena
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from tests.conftest import ROOT
 from tests.fusion.arena_process import ARENA, ServerProcess, cameras_at
 from tests.fusion.bridges.foxglove_reader import FoxgloveClient

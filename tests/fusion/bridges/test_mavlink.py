@@ -10,9 +10,9 @@ from pymavlink import mavutil
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz, wxyz_from_rotation
-from fusion.bridges.mavlink import MavlinkVehicle, RateDivider, ResetCounter
 from fusion.bridges.mavlink_frames import FrdFrames, roll_pitch_yaw
-from fusion.protocol.messages import FusionStatus
+from fusion.bridges.mavlink_vehicle import MavlinkVehicle, RateDivider, ResetCounter
+from fusion.protocol.pose_messages import FusionStatus
 from tests.conftest import free_port
 from tests.fusion.bridges.pose_server import PoseServer, bridge, moving_pose, restart
 from tests.missing_package import advice_without

@@ -20,11 +20,11 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from camera_node.protocol.session import listening_endpoints, open_router
 from fusion.bridges.body_motion import covariances, rotations, twists
-from fusion.bridges.ros2 import Ros2Node, ros_name
 from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transforms
+from fusion.bridges.ros2_node import Ros2Node, ros_name
 from fusion.client.arena import Arena
 from fusion.commands.bridges.ros2 import ros2
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from tests.conftest import free_port
 from tests.fusion.bridges.pose_server import PoseServer, publish_poses, restart
 

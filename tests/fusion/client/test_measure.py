@@ -10,7 +10,7 @@ from fusion.client.measure import StationaryMarkers, find_stationary_markers, ro
 from fusion.errors import FusionError
 from fusion.model.likeness import distances
 from fusion.model.robots import Robot, load_robots, require_distinct
-from fusion.protocol.messages import Markers
+from fusion.protocol.pose_messages import Markers
 from tests.conftest import ROOT
 from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line, ring
 from tests.fusion.tracks import track

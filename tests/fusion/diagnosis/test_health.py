@@ -13,8 +13,8 @@ import pytest
 
 from calib.rig.rig import Rig
 from fusion.diagnosis.machine import check_certificates, check_disk, check_listening, check_rig
-from fusion.protocol.health import assess_calibration
-from fusion.server.config import ArenaConfig
+from fusion.protocol.arena_health import assess_calibration
+from fusion.server.arena_config import ArenaConfig
 from tests.conftest import ROOT, free_port
 from tests.fusion.arena_process import ARENA, ServerProcess, cameras_at
 from tests.security.lab import certificates

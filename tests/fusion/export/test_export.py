@@ -20,7 +20,7 @@ from camera_node.geometry.pose import rotation_from_wxyz
 from camera_node.protocol.messages import encode
 from fusion.commands.export import export
 from fusion.model.robots import Robot
-from fusion.protocol.messages import RobotPose, Robots
+from fusion.protocol.pose_messages import RobotPose, Robots
 from tests.conftest import ROOT
 from tests.fusion.bridges.foxglove_reader import read_mcap
 from tests.fusion.bridges.pose_server import moving_pose

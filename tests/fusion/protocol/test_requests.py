@@ -16,8 +16,8 @@ from camera_node.protocol.session import open_client, open_router
 from fusion.client.define import LOST_AT_RESTART
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots
-from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
-from fusion.protocol.requests import change_robots
+from fusion.protocol.pose_messages import Robots, RobotsRequest, robots_key, set_robots_key
+from fusion.protocol.robot_requests import change_robots
 from fusion.tracking.tracker import PAUSED
 from tests.fusion.serving import (
     ARENA,

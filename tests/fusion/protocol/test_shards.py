@@ -15,7 +15,7 @@ from camera_node.protocol.messages import MessageError, decode, encode
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
-from fusion.protocol.messages import RobotPose, ShardPoses
+from fusion.protocol.pose_messages import RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import Server

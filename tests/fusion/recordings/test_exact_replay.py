@@ -15,7 +15,7 @@ from calib.rig.recording import read_messages
 from camera_node.protocol.messages import Detections, decode, encode
 from camera_node.protocol.session import open_client
 from fusion.commands.replay import replay
-from fusion.protocol.messages import FusedFrames, RobotPose
+from fusion.protocol.pose_messages import FusedFrames, RobotPose
 from tests.conftest import ROOT
 from tests.fusion.arena_process import ARENA, ServerProcess
 from tests.fusion.serving import KEYS

@@ -19,7 +19,7 @@ from calib.rig.recording import MAX_LOST, MIN_CHUNK, RecordingWriter, read_messa
 from calib.rig.recording_repair import repair_recording
 from camera_node.foundation.errors import ConfigError
 from fusion.commands.repair import repair
-from fusion.recordings.record import read_recording
+from fusion.recordings.arena_recording import read_recording
 from tests.conftest import ROOT
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.waiting import wait_for

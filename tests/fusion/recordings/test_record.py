@@ -18,8 +18,8 @@ from camera_node.protocol.messages import encode
 from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.model.limits import Limits
-from fusion.protocol.messages import Robots
-from fusion.recordings.record import ArenaRecorder, read_recording
+from fusion.protocol.pose_messages import Robots
+from fusion.recordings.arena_recording import ArenaRecorder, read_recording
 from fusion.recordings.run import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
 from tests.fusion.serving import ARENA, KEYS, config, live, run_program, send, serving

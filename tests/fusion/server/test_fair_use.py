@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from fusion.server.frame_quotas import FRAMES_PER_SET
 from fusion.server.transport import ABOVE_QUOTA
 from tests.fusion.traffic import (

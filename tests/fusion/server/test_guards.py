@@ -9,7 +9,7 @@ import pytest
 
 from camera_node.protocol.messages import Detections
 from camera_node.protocol.requests import respond
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from fusion.server.server import Server
 from fusion.server.transport import INTERNAL_ERROR
 from tests.fusion.serving import ARENA, DEADLINE_S, config, later, live, send, serving, until

@@ -21,7 +21,7 @@ from calib.rig.messages import redo_rig_key, set_rig_key, undo_rig_key
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
-from fusion.protocol.messages import robots_key, set_robots_key
+from fusion.protocol.pose_messages import robots_key, set_robots_key
 from tests.conftest import ROOT
 from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, live, serving_process
 from tests.waiting import wait_for

@@ -13,10 +13,10 @@ from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
 from camera_node.protocol.publishers import HANDOVER_NS
 from fusion.model.frames import CalibratedFrame
-from fusion.protocol.messages import FusionStatus
+from fusion.protocol.pose_messages import FusionStatus
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import ANOTHER_NODE, MAX_UNCALIBRATED, Ingest
-from fusion.server.status import PipelineStatus, ServerStatistics
+from fusion.server.server_statistics import PipelineStatus, ServerStatistics
 from fusion.tracking.result import TrackingResult
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import PERIOD_NS, SINGLE, START_NS, TRIANGLE, Arena, line

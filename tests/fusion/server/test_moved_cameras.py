@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from fusion.server.status import PipelineStatus, ServerStatistics
+from fusion.server.server_statistics import PipelineStatus, ServerStatistics
 from tests.benchmarks.faults.arena import small_load
 from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.faults.world import CameraFault

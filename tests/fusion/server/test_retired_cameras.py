@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A camera that was renamed or forgotten disappears from the status; one that is silent stays."""
 
-from fusion.server.status import SILENT_S, PipelineStatus, ServerStatistics
+from fusion.server.server_statistics import SILENT_S, PipelineStatus, ServerStatistics
 
 
 def test_a_retired_camera_is_listed_until_it_is_silent():

@@ -20,8 +20,8 @@ from camera_node.foundation.config import dump_yaml
 from camera_node.protocol.messages import Detections, decode, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
-from fusion.protocol.messages import FusedFrames, frames_key
-from fusion.server.config import ArenaConfig
+from fusion.protocol.pose_messages import FusedFrames, frames_key
+from fusion.server.arena_config import ArenaConfig
 from fusion.server.requests import RIG_ANSWERS_HZ
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port

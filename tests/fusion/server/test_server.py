@@ -17,7 +17,7 @@ from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import ClockReply, decode, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits
-from fusion.protocol.messages import FusionStatus, RobotPose, RobotPoses
+from fusion.protocol.pose_messages import FusionStatus, RobotPose, RobotPoses
 from fusion.server.server import Server
 from fusion.server.transport import TOO_SLOW
 from tests.conftest import ROOT

@@ -12,7 +12,7 @@ from calib.rig.camera import Camera
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, circle
 

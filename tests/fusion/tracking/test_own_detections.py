@@ -9,7 +9,7 @@ import pytest
 from camera_node.detection.roundels import Roundels
 from fusion.model.frames import CalibratedFrame
 from fusion.model.states import POSITION
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 from tests.fusion.tracks import errors, poses_of, track
 

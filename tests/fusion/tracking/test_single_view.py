@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fusion.protocol.messages import Markers
+from fusion.protocol.pose_messages import Markers
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
-from fusion.protocol.messages import RobotPose, TrackingState
+from fusion.protocol.pose_messages import RobotPose, TrackingState
 from web.demo.score import PoseScore, angle_deg, longest_gap_s, summarize
 from web.demo.usage import describe_overload
 

@@ -10,7 +10,7 @@ from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import example_file
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from fusion.model.robots import Robot, load_robots
-from fusion.protocol.messages import Markers, RobotPose
+from fusion.protocol.pose_messages import Markers, RobotPose
 from web.colours import CARD, CARD_UNSEEN
 from web.scene.bodies import Mesh, box_mesh, cylinder_mesh, enclosing_part
 from web.scene.robots import RobotDrawing

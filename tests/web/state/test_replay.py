@@ -13,7 +13,7 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import encode
 from fusion.commands.trim import trim
 from fusion.model.robots import Robot
-from fusion.protocol.messages import Robots, robots_key
+from fusion.protocol.pose_messages import Robots, robots_key
 from tests.waiting import wait_for
 from tests.web.arena import ArenaMessages, four_cameras
 from tests.web.browser import loopback

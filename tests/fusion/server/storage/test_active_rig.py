@@ -20,7 +20,7 @@ from camera_node.protocol.requests import RequestError
 from camera_node.protocol.session import open_router
 from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
-from fusion.server.config import ArenaConfig
+from fusion.server.arena_config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
 from tests.fusion.serving import (
     ARENA,

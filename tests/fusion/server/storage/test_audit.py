@@ -14,8 +14,8 @@ from calib.live.rig_requests import redo_rig, set_rig, undo_rig
 from calib.rig.rig import Rig
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
-from fusion.protocol.messages import RobotsRequest
-from fusion.protocol.requests import change_robots
+from fusion.protocol.pose_messages import RobotsRequest
+from fusion.protocol.robot_requests import change_robots
 from fusion.server.storage.audit import REFUSED_BURST, quote
 from fusion.server.storage.audit_file import MAX_OLD, AuditFile
 from tests.conftest import ROOT

@@ -18,7 +18,7 @@ from typing import Any
 from camera_node.foundation.errors import AddressError, ConfigError
 from fusion.bridges import vrpn_messages as vrpn
 from fusion.bridges.pose_queue import WAIT_S, PoseQueue
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 
 log = logging.getLogger("fusion.vrpn")
 

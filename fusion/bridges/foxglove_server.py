@@ -16,7 +16,7 @@ from camera_node.protocol.messages import MessageError, Preview, decode
 from camera_node.protocol.tcp_sockets import tcp_sockets
 from fusion.bridges.foxglove_channels import FoxgloveChannels
 from fusion.client.arena import Arena
-from fusion.protocol.messages import FusionStatus, Markers
+from fusion.protocol.pose_messages import FusionStatus, Markers
 
 log = logging.getLogger("fusion.foxglove")
 

@@ -17,7 +17,7 @@ from camera_node.geometry.pose import wxyz_from_rotation
 from camera_node.node.clock_sync import ClockSync
 from fusion.bridges.mavlink_frames import FrdFrames, FrdPose, roll_pitch_yaw, upper_triangle
 from fusion.bridges.pose_queue import WAIT_S, PoseQueue
-from fusion.protocol.messages import FusionStatus, RobotPose
+from fusion.protocol.pose_messages import FusionStatus, RobotPose
 
 ADDRESS = re.compile(r"udp:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):(?P<port>\d{1,5})")
 HEARTBEAT_S = 1.0

@@ -24,7 +24,7 @@ from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
-from fusion.protocol.messages import FusedFrames, FusionStatus, RobotPose, Robots, robots_key
+from fusion.protocol.pose_messages import FusedFrames, FusionStatus, RobotPose, Robots, robots_key
 from fusion.recordings.rotation import RotatingWriter
 
 Entry = tuple[str, bytes, int]  # key, data, time of arrival in ns

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from calib.rig.rig import Rig
-from fusion.protocol.messages import CameraHealth, FusionStatus
+from fusion.protocol.pose_messages import CameraHealth, FusionStatus
 
 MAX_CALIBRATION_DAYS = 90
 POOR_GRADES = "CD"

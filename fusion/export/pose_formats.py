@@ -13,10 +13,10 @@ from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
 from fusion.bridges.foxglove_channels import FoxgloveChannels
-from fusion.bridges.ros2 import ros_name
 from fusion.bridges.ros2_messages import odometries, pose_stamped, transforms
+from fusion.bridges.ros2_node import ros_name
 from fusion.export.points import PointTrajectories
-from fusion.export.poses import RecordedPoses
+from fusion.export.recorded_poses import RecordedPoses
 from fusion.recordings.report import write_pose_table
 
 MAX_FRAMES = 65535  # of a C3D file, whose counter has 16 bits

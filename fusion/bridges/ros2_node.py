@@ -22,7 +22,7 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.logs import about
 from camera_node.protocol.relative import RelativePositions
 from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, relative_poses, transforms
-from fusion.protocol.messages import RobotPose
+from fusion.protocol.pose_messages import RobotPose
 
 log = logging.getLogger("fusion.ros2")
 NODE = "roundel"

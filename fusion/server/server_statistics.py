@@ -15,7 +15,7 @@ import numpy as np
 from camera_node.foundation.logs import about
 from fusion.model.limits import Limits
 from fusion.monitoring.clocks.camera_clocks import ClockHealth
-from fusion.protocol.messages import CameraHealth, FusionStatus, TrackingState
+from fusion.protocol.pose_messages import CameraHealth, FusionStatus, TrackingState
 from fusion.tracking.result import CameraUse
 
 log = logging.getLogger("fusion")

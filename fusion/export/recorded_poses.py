@@ -11,7 +11,7 @@ from calib.rig.recording import read_messages
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import MessageError, decode
 from fusion.model.robots import Robot
-from fusion.protocol.messages import RobotPose, Robots
+from fusion.protocol.pose_messages import RobotPose, Robots
 
 
 class RecordedPoses:

@@ -11,7 +11,7 @@ from camera_node.protocol.messages import MessageError, decode, encode
 from camera_node.protocol.requests import REQUEST_S, RequestError, RequestSource, send_request
 from fusion.errors import FusionError
 from fusion.model.robots import Robot
-from fusion.protocol.messages import Robots, RobotsRequest, robots_key, set_robots_key
+from fusion.protocol.pose_messages import Robots, RobotsRequest, robots_key, set_robots_key
 
 
 def change_robots(
