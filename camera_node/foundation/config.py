@@ -27,7 +27,7 @@ def example_file(name: str) -> Path:
     Raises:
         ConfigError: there is neither.
     """
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     for configs in (package.parent / "configs", package / "configs"):
         if (path := configs / name).is_file():
             return path
