@@ -84,8 +84,8 @@ def test_a_camera_node_runs_without_the_server_extra(extra: str):
     """A camera's computer does not have the packages of the extra."""
     code = (
         f"import sys; sys.modules[{extra!r}] = None\n"
-        "import camera_node.__main__, camera_node.sources.v4l2.source, camera_node.node.node\n"
-        "import camera_node.sources.observations\n"
+        "import camera_node.__main__, camera_node.sources.v4l2_cameras, camera_node.node.node\n"
+        "import camera_node.sources.recorded_detections\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 

@@ -78,7 +78,7 @@ def test_what_the_detector_refuses(tmp_path: Path):
 
 
 def test_a_network_camera():
-    """Its options exist; tests/camera_node/sources/test_stream.py reads streams."""
+    """Its options exist; tests/camera_node/sources/test_network_stream.py reads streams."""
     (command,) = page("network_cameras.md")
     camera = tyro.cli(JoinArena, args=shlex.split(command)[2:])
     assert (camera.source[0].partition(":")[0], camera.name) == ("rtsp", "north")

@@ -17,7 +17,7 @@ from camera_node.foundation.config import example_file
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
-from camera_node.sources.observations import detect_frames, read_observations
+from camera_node.sources.recorded_detections import detect_frames, read_observations
 
 Synchronised = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(aliases=["--synchronized"])]
 

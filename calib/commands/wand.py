@@ -33,7 +33,7 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import console, progress_console, say
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
-from camera_node.sources.observations import read_observations
+from camera_node.sources.recorded_detections import read_observations
 
 PROGRAM = "calib wand"
 

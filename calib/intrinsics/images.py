@@ -13,7 +13,7 @@ from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import CameraError
 from camera_node.protocol.messages import Keys
 from camera_node.sources.grey import to_grey
-from camera_node.sources.replay import IMAGES, read_grey
+from camera_node.sources.recorded_frames import IMAGES, read_grey
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov")
 MAX_FRAMES = 600  # read from a video, evenly spaced: a lens needs 60 good ones

@@ -19,9 +19,8 @@ from camera_node.foundation.service import ServiceManager, stopped_by_signals
 from camera_node.foundation.supervisor import Supervisor
 from camera_node.foundation.terminal import say
 from camera_node.protocol.discovery import FoundArena, choose_arena, find_arenas
-from camera_node.sources.address import without_credentials
 from camera_node.sources.drivers import local_cameras
-from camera_node.sources.frame import SourceSettings
+from camera_node.sources.frame import SourceSettings, without_credentials
 
 TICK_S = 0.25
 MAX_CHECK_S = 3600.0

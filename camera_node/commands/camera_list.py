@@ -5,7 +5,7 @@ import msgspec
 from rich.table import Table
 
 from camera_node.foundation.terminal import console, progress_console, say
-from camera_node.sources.description import CameraDescription, Mode
+from camera_node.sources.camera_description import CameraDescription, Mode
 from camera_node.sources.drivers import all_cameras
 
 SHOWN_SIZES = 4  # of one camera in the table

@@ -21,7 +21,7 @@ from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.foundation.terminal import console, say
 from camera_node.geometry.lens import Lens, load_lens
-from camera_node.sources.replay import read_grey
+from camera_node.sources.recorded_frames import read_grey
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")  # of the pictures of a folder
 PASSES = 2  # over a picture: the first one learns prints and tone curve

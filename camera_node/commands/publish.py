@@ -16,12 +16,10 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.service import ServiceManager, StopEvent, stopped_by_signals
 from camera_node.protocol.registration import CameraRegistration
 from camera_node.simulation.camera import SimulatedCamera
-from camera_node.sources.address import is_url
-from camera_node.sources.drivers import driver_of
-from camera_node.sources.frame import Source, SourceSettings
-from camera_node.sources.identity import SourceIdentity, identify, is_simulation
-from camera_node.sources.replay import ArenaTime, FrameFolder, PacedSource, VideoFile
-from camera_node.sources.stream import open_stream
+from camera_node.sources.drivers import SourceIdentity, driver_of, identify, is_simulation
+from camera_node.sources.frame import Source, SourceSettings, is_url
+from camera_node.sources.network_stream import open_stream
+from camera_node.sources.recorded_frames import ArenaTime, FrameFolder, PacedSource, VideoFile
 
 if typing.TYPE_CHECKING:
     import zenoh

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Frames, the interface of their sources, and the settings with which a source is opened."""
+"""Frames, the interface of their sources, and the settings and addresses with which a source is opened."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,6 +10,8 @@ from typing import Literal, Protocol
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import ControlValue
+
+URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,3 +138,19 @@ def _parse_value(text: str) -> ControlValue:
         except ValueError:
             continue
     return text
+
+
+def is_url(source: str) -> bool:
+    """Whether the value of `--source` is the address of a network stream, such as rtsp://host/stream."""
+    return URL.match(source) is not None
+
+
+def without_credentials(source: str) -> str:
+    """A source as it may be printed: user and password before the last `@`, and the query, are replaced by `***`.
+
+    Everything before the last `@` counts as credentials, because users do not escape `/`, `?` or `@` in a password.
+    """
+    scheme = match.group() if (match := URL.match(source)) else ""
+    _, at, rest = source[len(scheme) :].rpartition("@")
+    path, query, _ = rest.partition("?")
+    return f"{scheme}{'***@' * bool(at)}{path}{'?***' * bool(query)}"

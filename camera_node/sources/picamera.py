@@ -20,8 +20,7 @@ from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import CameraAbsentError, CameraError, ConfigError
 from camera_node.foundation.extras import require
 from camera_node.protocol.messages import ControlValue
-from camera_node.sources.controls import Control, check_controls
-from camera_node.sources.description import CameraDescription, Mode
+from camera_node.sources.camera_description import CameraDescription, Control, Mode, check_controls
 from camera_node.sources.frame import Frame, SourceSettings
 from camera_node.sources.live import Capture, LiveSource
 

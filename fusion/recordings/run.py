@@ -9,7 +9,7 @@ from pathlib import Path
 from calib.rig.camera import Camera
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections
-from camera_node.sources.observations import detect_frames, read_observations
+from camera_node.sources.recorded_detections import detect_frames, read_observations
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot

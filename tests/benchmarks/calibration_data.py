@@ -35,7 +35,7 @@ from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from camera_node.protocol.messages import Detections
-from camera_node.sources.observations import detect_frames
+from camera_node.sources.recorded_detections import detect_frames
 from tests.benchmarks.calibration_recordings import DATA, board_corners, corner_errors, recording
 from tests.calib.mishaps import repack
 from tests.calib.synthetic import WAND, camera_errors

@@ -10,7 +10,7 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
 from camera_node.foundation.arrays import Array
 from camera_node.protocol.messages import Detections
-from camera_node.sources.observations import read_observations
+from camera_node.sources.recorded_detections import read_observations
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 SQUARE_M = 0.054

@@ -14,7 +14,7 @@ from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose, invert
 from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
-from camera_node.sources.observations import detect_frames
+from camera_node.sources.recorded_detections import detect_frames
 
 SECONDS = 6.0
 FOLDER = Path(__file__).resolve().parent / "wand"

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from camera_node.sources.replay import read_grey
+from camera_node.sources.recorded_frames import read_grey
 from tests.benchmarks.detector.pictures import Grey
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from calib.rig.rig import Rig, load_rig, save_rig
-from camera_node.sources.observations import write_observations
+from camera_node.sources.recorded_detections import write_observations
 from tests.calib.boards import SPEC, board_poses, render
 from tests.calib.synthetic import Arena, assert_near, record, ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world

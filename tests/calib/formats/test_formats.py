@@ -22,7 +22,7 @@ from calib.wand.calibrate import calibrate
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_from_wxyz
-from camera_node.sources.observations import read_observations
+from camera_node.sources.recorded_detections import read_observations
 from tests.calib.stick import LENGTH_M, write_stick
 from tests.calib.synthetic import camera_errors, ring
 

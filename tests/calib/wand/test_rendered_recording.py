@@ -10,7 +10,7 @@ from calib.rig.rig import load_rig
 from calib.wand.calibrate import calibrate
 from camera_node.foundation.config import load_yaml
 from camera_node.geometry.body import Body
-from camera_node.sources.observations import read_observations
+from camera_node.sources.recorded_detections import read_observations
 from tests.calib.synthetic import camera_errors, joint_error
 
 ROOT = Path(__file__).resolve().parents[3]

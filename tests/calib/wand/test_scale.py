@@ -18,7 +18,7 @@ from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibra
 from calib.wand.scale import Distance, compare_distance
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
-from camera_node.sources.observations import write_observations
+from camera_node.sources.recorded_detections import write_observations
 from tests.calib.recordings import WandScenario
 from tests.calib.recordings import record as record_wave
 from tests.calib.synthetic import EXACT, OLD, Arena, assert_near, record, ring, roughly

@@ -16,7 +16,7 @@ from camera_node.detection.detector import Detector
 from camera_node.foundation.config import example_file, load_yaml
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
-from camera_node.sources.replay import read_grey
+from camera_node.sources.recorded_frames import read_grey
 from fusion.model.robots import load_robots
 
 DPI = 300

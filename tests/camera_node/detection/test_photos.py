@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from camera_node.detection.detector import Detector
-from camera_node.sources.replay import read_grey
+from camera_node.sources.recorded_frames import read_grey
 
 
 def test_a_photograph_of_many_roundels(shared_data: Callable[[str], Path]):

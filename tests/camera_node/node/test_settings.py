@@ -11,7 +11,7 @@ from camera_node.node.settings import apply_settings, read_settings
 from camera_node.protocol.messages import Settings
 from camera_node.sources.frame import SourceSettings
 from camera_node.sources.live import LiveSource
-from camera_node.sources.replay import PacedSource
+from camera_node.sources.recorded_frames import PacedSource
 from tests.camera_node.sources.video_camera import VideoCamera, write_video
 
 

@@ -19,7 +19,7 @@ from camera_node.simulation.camera import SimulatedCamera
 from camera_node.simulation.recording import render_recording
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import Scene
-from camera_node.sources.replay import FrameFolder, read_grey
+from camera_node.sources.recorded_frames import FrameFolder, read_grey
 from tests.camera_node.scenes import CAMERA, DISC, write_scene
 from tests.conftest import ROOT
 

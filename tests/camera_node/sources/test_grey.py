@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from camera_node.detection.detector import Detector
 from camera_node.sources.grey import BAYER, narrow, to_grey
-from camera_node.sources.replay import FrameFolder
+from camera_node.sources.recorded_frames import FrameFolder
 from tests.camera_node.rendering import Disc, outer_conic, render
 
 LEVELS = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10

@@ -13,8 +13,8 @@ from camera_node.clocks.host_clock import unix_ahead_ns
 from camera_node.commands.publish import open_source
 from camera_node.foundation.errors import CameraAbsentError, ConfigError
 from camera_node.sources import picamera
+from camera_node.sources.drivers import identify
 from camera_node.sources.frame import Frame, SourceSettings
-from camera_node.sources.identity import identify
 from tests.camera_node.sources import picamera2_standin
 from tests.camera_node.sources.picamera2_standin import METADATA, MODES, CompletedRequest, Picamera2
 from tests.missing_package import advice_without

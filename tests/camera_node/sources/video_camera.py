@@ -10,7 +10,7 @@ import numpy as np
 
 from camera_node.foundation.errors import CameraError
 from camera_node.protocol.messages import ControlValue
-from camera_node.sources.controls import Control
+from camera_node.sources.camera_description import Control
 from camera_node.sources.frame import Frame
 from camera_node.sources.grey import to_grey
 from camera_node.sources.live import Capture

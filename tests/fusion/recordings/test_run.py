@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calib.rig.rig import Rig, save_rig
-from camera_node.sources.observations import write_observations
+from camera_node.sources.recorded_detections import write_observations
 from fusion.commands.run import run
 from fusion.model.robots import Robot
 from fusion.recordings.report import COLUMNS

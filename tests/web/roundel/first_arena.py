@@ -31,7 +31,7 @@ from camera_node.foundation.arrays import Array, Grey
 from camera_node.foundation.config import example_file
 from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
-from camera_node.sources.replay import read_grey
+from camera_node.sources.recorded_frames import read_grey
 from tests.benchmarks.faults.network import Loopback
 from tests.conftest import free_port
 from tests.waiting import wait_for

@@ -19,9 +19,9 @@ import pytest
 from camera_node.clocks.host_clock import unix_ahead_ns
 from camera_node.commands.publish import open_source
 from camera_node.foundation.errors import CameraAbsentError, CameraError, ConfigError
+from camera_node.sources.drivers import identify
 from camera_node.sources.frame import Frame, Source, SourceSettings
-from camera_node.sources.genicam.source import list_genicam
-from camera_node.sources.identity import identify
+from camera_node.sources.genicam.genicam_source import list_genicam
 from tests.camera_node.sources.genicam.fake_gige import FakeCamera, monotonic_of, stamp_in
 from tests.conftest import ROOT
 from tests.waiting import DEADLINE_S, wait_for

@@ -26,8 +26,8 @@ from pathlib import Path
 import msgspec
 from camera_node.foundation.errors import ConfigError
 from camera_node.sources.frame import SourceSettings
-from camera_node.sources.v4l2.devices import describe
-from camera_node.sources.v4l2.source import open_v4l2
+from camera_node.sources.v4l2_cameras import describe
+from camera_node.sources.v4l2_cameras import open_v4l2
 
 device = Path(sys.argv[1])
 found = {"listed": msgspec.to_builtins(describe(device, "Fake Camera"))}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera_node.sources.genicam.pixels import parse_pixel_format
+from camera_node.sources.genicam.pixel_formats import parse_pixel_format
 from camera_node.sources.grey import to_grey
 
 SHAPE = (6, 7)  # an odd number of pixels in a row: packed groups cross rows

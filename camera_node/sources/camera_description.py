@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Controls that a camera's driver offers by name, and the check of a value before it is set."""
+"""What a driver states about a camera: its modes, its controls by name, and the check of a value before it is set."""
 
 import difflib
 from collections.abc import Mapping
@@ -80,3 +80,39 @@ def _fault_of_number(control: Control, value: float) -> str:
     if control.kind == "integer" and control.step and (value - low) % control.step:
         return f"give {low:g} plus a multiple of {control.step:g}"
     return ""
+
+
+class Mode(msgspec.Struct, frozen=True):
+    """A format of a camera's images.
+
+    Attributes:
+        width, height: pixels.
+        pixels: the pixel format, as the driver calls it.
+        max_fps: the greatest frame rate; None where unknown.
+    """
+
+    width: int
+    height: int
+    pixels: str
+    max_fps: float | None = None
+
+
+class CameraDescription(msgspec.Struct, frozen=True):
+    """A camera.
+
+    Attributes:
+        driver: v4l2, genicam or picamera.
+        source: what `--source` takes to open it.
+        name: its model.
+        serial: its serial number; empty without one.
+        modes, controls: empty where unknown.
+        note: why it can't be used now, or else.
+    """
+
+    driver: str
+    source: str
+    name: str
+    serial: str = ""
+    modes: tuple[Mode, ...] = ()
+    controls: tuple[Control, ...] = ()
+    note: str = ""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.sources.address import is_url, without_credentials
+from camera_node.sources.frame import is_url, without_credentials
 from tests.waiting import DEADLINE_S
 
 SOURCES = (

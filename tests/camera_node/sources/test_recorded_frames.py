@@ -13,7 +13,7 @@ import pytest
 from camera_node.commands.publish import open_source
 from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.sources.frame import Frame, SourceSettings
-from camera_node.sources.replay import FrameFolder, VideoFile, read_grey
+from camera_node.sources.recorded_frames import FrameFolder, VideoFile, read_grey
 
 MS = 1_000_000
 FAST = SourceSettings(pace="fast")

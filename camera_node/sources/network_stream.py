@@ -17,9 +17,8 @@ from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import CameraAbsentError, CameraError, ConfigError
 from camera_node.foundation.extras import require
 from camera_node.protocol.messages import ControlValue
-from camera_node.sources.address import URL, without_credentials
-from camera_node.sources.controls import Control
-from camera_node.sources.frame import Frame
+from camera_node.sources.camera_description import Control
+from camera_node.sources.frame import URL, Frame, without_credentials
 from camera_node.sources.live import Capture, LiveSource
 
 SCHEMES = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443}  # with their ports

@@ -9,8 +9,7 @@ import pytest
 from camera_node.commands.publish import open_source
 from camera_node.foundation.errors import CameraError
 from camera_node.sources.frame import SourceSettings
-from camera_node.sources.v4l2.devices import camera_names, find_device
-from camera_node.sources.v4l2.source import capture_time, open_capture, properties
+from camera_node.sources.v4l2_cameras import camera_names, capture_time, find_device, open_capture, properties
 
 
 @pytest.fixture

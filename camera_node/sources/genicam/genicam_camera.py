@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from camera_node.clocks.clock_offset import RoundTrip
 from camera_node.foundation.errors import CameraAbsentError, CameraError
 from camera_node.protocol.messages import ControlValue
-from camera_node.sources.controls import Control
-from camera_node.sources.description import Mode
+from camera_node.sources.camera_description import Control, Mode
 from camera_node.sources.frame import SourceSettings
 from camera_node.sources.genicam.aravis import Aravis, AravisError, load_aravis
-from camera_node.sources.genicam.pixels import PixelFormat, parse_pixel_format
+from camera_node.sources.genicam.pixel_formats import PixelFormat, parse_pixel_format
 
 WRITABLE = (1, 2)  # ARV_GC_ACCESS_MODE_WO, _RW
 PREFERRED = ("Mono8", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8")

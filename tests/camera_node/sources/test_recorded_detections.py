@@ -10,7 +10,7 @@ import pytest
 from camera_node.detection.roundels import Roundels
 from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.protocol.messages import Detections
-from camera_node.sources.observations import detect_frames, read_observations, write_observations
+from camera_node.sources.recorded_detections import detect_frames, read_observations, write_observations
 
 
 def message(camera: str, seq: int, t_ns: int, uv: np.ndarray, numbers: list[int]) -> Detections:

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from camera_node.node.registration import camera_id
-from camera_node.sources.identity import identify
-from camera_node.sources.v4l2.devices import device_key
+from camera_node.sources.drivers import identify
+from camera_node.sources.v4l2_cameras import device_key
 
 
 def plug_in(sys: Path, number: int, port: str, serial: str) -> Path:

@@ -12,7 +12,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.foundation.terminal import track
 from camera_node.protocol.messages import Detections
-from camera_node.sources.replay import FrameFolder
+from camera_node.sources.recorded_frames import FrameFolder
 
 SIGMA_PX = 0.3  # assumed standard deviation of a centre from a file without covariances
 MAX_FPS = 1e5

@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""GenICam cameras (GigE Vision and USB3 Vision) as a source of frames."""
+"""GenICam cameras (GigE Vision and USB3 Vision) as a source of frames, and the stream of images of one camera."""
 
 import contextlib
+import ctypes
 import queue
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from ctypes import byref, c_size_t, c_ubyte, c_uint64
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from camera_node.clocks.device_clock import DeviceClock
+from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.protocol.messages import ControlValue
-from camera_node.sources.controls import Control, check_controls
-from camera_node.sources.description import CameraDescription
+from camera_node.sources.camera_description import CameraDescription, Control, check_controls
 from camera_node.sources.frame import Frame, SourceSettings
-from camera_node.sources.genicam.aravis import AravisError
-from camera_node.sources.genicam.camera import FoundCamera, GenicamCamera, find_camera, find_cameras
-from camera_node.sources.genicam.stream import GenicamStream, StampedImage
+from camera_node.sources.genicam.aravis import AravisError, load_aravis
+from camera_node.sources.genicam.genicam_camera import FoundCamera, GenicamCamera, find_camera, find_cameras
+from camera_node.sources.genicam.pixel_formats import PixelFormat
 from camera_node.sources.live import Capture, LiveSource
 
 POP_S = 0.1  # longest wait for one buffer, between looks at other requests
@@ -25,6 +29,9 @@ START_S = 2.0  # longest wait for the first frame of a camera that runs freely
 SILENCE_S = 1.0  # without a further frame, after which it counts as lost
 REOPEN_S = 0.2  # between attempts, each of which waits for the camera's answer
 REQUEST_S = 10.0  # longest wait of another thread for the one that reads
+N_BUFFERS = 8
+COMPLETE = 0  # ARV_BUFFER_STATUS_SUCCESS
+MAX_PAYLOAD = 256_000_000  # bytes of one image
 
 
 class GenicamCapture(Capture):
@@ -86,7 +93,7 @@ class GenicamCapture(Capture):
             if (stamped := self._stream.pop(POP_S)) is not None:
                 self._known_lost, self._has_delivered = self._stream.lost_packets(), True
                 self._clock.refresh()  # not of a silent camera: a request without an answer takes three seconds
-                return self._frame(stamped)
+                return self._frame(*stamped)
             if not self._camera.is_controlled():
                 raise CameraError("the camera does not answer any more, or another program took it over")
         self._known_lost = self._stream.lost_packets()
@@ -121,9 +128,9 @@ class GenicamCapture(Capture):
         self._stream = GenicamStream(self._camera, self._camera.pixel_format())
         self._known_lost, self._has_delivered = 0, False
 
-    def _frame(self, stamped: StampedImage) -> Frame:
-        t_ns, error_us = self._clock.to_unix(stamped.device_ns)
-        return Frame(stamped.image, t_ns + round(self._exposure_us * 500), self._exposure_us, error_us)
+    def _frame(self, image: Grey, device_ns: int) -> Frame:
+        t_ns, error_us = self._clock.to_unix(device_ns)
+        return Frame(image, t_ns + round(self._exposure_us * 500), self._exposure_us, error_us)
 
     def _apply(
         self, exposure_us: float | None, gain: float | None, controls: Mapping[str, ControlValue]
@@ -216,3 +223,83 @@ def _describe(found: FoundCamera) -> CameraDescription:
         return CameraDescription("genicam", found.source, name, found.serial, note=str(error))
     finally:
         camera.close()
+
+
+class GenicamStream:
+    """A running acquisition, until `close`.
+
+    Attributes:
+        incomplete: images of which packets are missing.
+
+    Raises:
+        AravisError: the camera refuses to start.
+    """
+
+    def __init__(self, camera: GenicamCamera, pixel_format: PixelFormat) -> None:
+        self._aravis, self._camera, self._format = load_aravis(), camera, pixel_format
+        self.incomplete = 0
+        payload = self._aravis.call("arv_camera_get_payload", camera.handle)
+        if not 0 < payload <= MAX_PAYLOAD:
+            raise AravisError(f"{camera.name} states images of {payload} bytes")
+        self._handle: int = self._aravis.call("arv_camera_create_stream", camera.handle, None, None)
+        try:
+            for _ in range(N_BUFFERS):
+                buffer = self._aravis.plain("arv_buffer_new_allocate", payload)
+                self._aravis.plain("arv_stream_push_buffer", self._handle, buffer)
+            self._aravis.call("arv_camera_start_acquisition", camera.handle)
+        except AravisError:
+            self._aravis.release(self._handle)
+            raise
+
+    def pop(self, timeout_s: float) -> tuple[Grey, int] | None:
+        """The next complete image (h, w) and the camera's own time stamp, ns; None if none arrives in time.
+
+        Raises:
+            AravisError: after `close`.
+        """
+        if not self._handle:
+            raise AravisError("the acquisition did not start again")
+        buffer = self._aravis.plain("arv_stream_timeout_pop_buffer", self._handle, round(timeout_s * 1e6))
+        if not buffer:
+            return None
+        try:
+            return self._convert(buffer)
+        finally:
+            self._aravis.plain("arv_stream_push_buffer", self._handle, buffer)
+
+    def lost_packets(self) -> int:
+        """Packets that never arrived, since the start; 0 for USB."""
+        if not (self._handle and self._camera.is_network):
+            return 0
+        resent, missing = c_uint64(), c_uint64()
+        self._aravis.plain("arv_gv_stream_get_statistics", self._handle, byref(resent), byref(missing))
+        return missing.value
+
+    def close(self) -> None:
+        """Stop the acquisition; also of a camera that no longer answers, and twice."""
+        handle, self._handle = self._handle, 0
+        if not handle:
+            return
+        if self._camera.is_controlled():  # otherwise each request takes seconds until it fails
+            with contextlib.suppress(AravisError):
+                self._aravis.call("arv_camera_stop_acquisition", self._camera.handle)
+        self._aravis.release(handle)
+
+    def _convert(self, buffer: int) -> tuple[Grey, int] | None:
+        if self._aravis.plain("arv_buffer_get_status", buffer) != COMPLETE:
+            self.incomplete += 1
+            return None
+        size = c_size_t()
+        address = self._aravis.plain("arv_buffer_get_image_data", buffer, byref(size))
+        width = self._aravis.plain("arv_buffer_get_image_width", buffer)
+        height = self._aravis.plain("arv_buffer_get_image_height", buffer)
+        if not address or width <= 0 or height <= 0:
+            self.incomplete += 1
+            return None
+        pixels = np.ctypeslib.as_array(ctypes.cast(address, ctypes.POINTER(c_ubyte)), (size.value,))
+        try:
+            image = self._format.to_grey(pixels, width, height)
+        except ValueError:
+            self.incomplete += 1
+            return None
+        return image, self._aravis.plain("arv_buffer_get_timestamp", buffer)

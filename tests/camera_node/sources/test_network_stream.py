@@ -13,7 +13,7 @@ from camera_node.clocks.arrival_clock import LEAST_US, UNKNOWN_US, ArrivalClock
 from camera_node.commands.publish import open_source
 from camera_node.foundation.errors import CameraAbsentError, ConfigError
 from camera_node.sources.frame import SourceSettings
-from camera_node.sources.stream import open_stream
+from camera_node.sources.network_stream import open_stream
 from fusion.model.frames import clock_sigma_s
 from tests.camera_node.sources import rtsp_server
 from tests.camera_node.sources.mjpeg_server import SHAPE, MjpegServer
