@@ -15,6 +15,9 @@ from camera_node.foundation.errors import ConfigError
 MAX_BYTES = 1 << 20  # 64 cameras with covariances take a tenth of it
 MAX_DEPTH = 32  # nested lists and mappings; no file of this project has more than 6
 MAX_VALUES = 100_000  # about 1 kB of memory each while a file is read
+# libyaml reads ahead of its events by at most 1024 characters of a line, and refuses 1000 levels: that many brackets in
+# 1024 characters have a run of 40.
+DEEP_RUN = re.compile(rb"[\[{]{%d}" % (MAX_DEPTH + 1))
 OPENCV_SYNTAX = re.compile(rb"\A%YAML:1\.0[^\n]*\n|!!opencv-matrix")
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -79,6 +82,8 @@ class _Extent:
 
 def _require_bounded(text: bytes) -> None:
     """Raise YAMLError for tags, and for too many levels or values, aliases expanded. The parser does not recurse."""
+    if deep := DEEP_RUN.search(text):
+        raise _excess(f"{MAX_DEPTH} levels", text.count(b"\n", 0, deep.start()) + 1)
     open_extents, anchored = [_Extent(None)], dict[str, _Extent]()
     for event in yaml.parse(text, _Loader):
         line = event.start_mark.line + 1
@@ -94,7 +99,11 @@ def _require_bounded(text: bytes) -> None:
         n_values = sum(extent.n_values for extent in open_extents)
         if depth > MAX_DEPTH or n_values > MAX_VALUES:
             fault = f"{MAX_DEPTH} levels" if depth > MAX_DEPTH else f"{MAX_VALUES} values"
-            raise yaml.YAMLError(f"more than {fault} at line {line}; is it the right file?")
+            raise _excess(fault, line)
+
+
+def _excess(fault: str, line: int) -> yaml.YAMLError:
+    return yaml.YAMLError(f"more than {fault} at line {line}; is it the right file?")
 
 
 def _extent_of(event: yaml.Event, open_extents: list[_Extent], anchored: dict[str, _Extent]) -> _Extent:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The page in a real browser, with messages over Zenoh."""
 
+import errno
+import os
 import re
 import socket
 import threading
@@ -199,7 +201,7 @@ def test_a_port_in_use_is_an_error():
     """Viser itself would silently use the next one."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        with pytest.raises(WebError, match=rf"127.0.0.1:{port} \(Address already in use\).*--port"):
+        with pytest.raises(WebError, match=rf"127.0.0.1:{port} \({os.strerror(errno.EADDRINUSE)}\).*--port"):
             check_port("127.0.0.1", port)
     with pytest.raises(WebError, match=r"70000.*--port"):
         check_port("127.0.0.1", 70_000)

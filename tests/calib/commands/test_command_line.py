@@ -64,7 +64,7 @@ def test_wand_then_world_from_a_csv(tmp_path: Path, arena: Arena):
     ("file", "text", "fault"),
     [
         ("wand.yaml", "diameter_m: 0.1\nmarkers: [[0,0,0],[0.2,0,0],[0.4,0,0]]\n", "symmetric"),
-        ("wand.yaml", "diameter_m: 0.1\nmarker: [[0,0,0]]\n", "unknown field"),
+        ("wand.yaml", "diameter_m: 0.1\nmarker: [[0,0,0]]\n", "did you mean `markers`"),
         ("lenses.yaml", "cameras: {cam0: {time_offset_ms: 1.0}}\n", "no intrinsics"),
         ("lenses.yaml", "cameras: [", "not valid YAML"),
         ("lenses.yaml", "cameras: {cam0: {}, cam0: {}}\n", "'cam0' is defined twice"),

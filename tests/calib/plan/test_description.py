@@ -30,7 +30,7 @@ def test_a_lens_is_given_by_its_field_of_view_its_focal_length_or_the_catalogue(
         ("fov_deg: 75, focal_px: 900", "one of fov_deg and focal_px"),
         ("fov_deg: 190", "1 to 170"),
         ("focal_px: -3", "focal lengths"),
-        ("fov_deg: 75, colour: 3", "unknown field"),
+        ("fov_deg: 75, colour: 3", "`colour`.*known fields: "),
         ("model: nikon", "catalogue has no camera 'nikon'"),
         ("model: rpi-3, focal_mm: 6", "can't be changed"),
     ],

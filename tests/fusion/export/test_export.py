@@ -4,6 +4,7 @@
 import csv
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,7 @@ def test_c3d_is_read_by_two_libraries(recording: Path, tmp_path: Path):
     for k, label in enumerate(labels):
         assert_points(label, content["data"]["points"][:3, k].T, HERMITE_MM + FLOAT32_MM)
     with out.open("rb") as file:
-        with pytest.warns(UserWarning, match="No analog data"):
+        with warnings.catch_warnings(action="ignore"):  # it has no analog data
             reader = c3d.Reader(file)
         frames = np.array([points for _, points, _ in reader.read_frames()])
     assert [label.strip() for label in reader.point_labels] == labels

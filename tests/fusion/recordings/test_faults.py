@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Recordings survive what happens to recorders: existing files, signals, full disks, power cuts."""
 
+import errno
 import math
+import os
 import random
 import signal
 import subprocess
@@ -143,7 +145,7 @@ def test_a_full_disk_ends_the_recording_in_one_line(tmp_path):
     assert process.returncode == 2
     assert len(lines) == 1, errors
     assert "live.mcap" in lines[0]
-    assert "File too large" in lines[0]
+    assert os.strerror(errno.EFBIG) in lines[0]
     assert LIMIT / 2 < path.stat().st_size <= LIMIT
     assert KEYS.rig in {key for key, _, _ in indexed(path)}
     assert f"{len(indexed(path))} messages" in lines[0]
@@ -151,7 +153,7 @@ def test_a_full_disk_ends_the_recording_in_one_line(tmp_path):
 
 def test_a_disk_without_any_space_is_one_error():
     """/dev/full refuses every byte."""
-    with pytest.raises(ConfigError, match="No space left"):
+    with pytest.raises(ConfigError, match=os.strerror(errno.ENOSPC)):
         write(Path("/dev/full"), entries(200))
 
 
