@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PROGRAMS = ("camera_node", "calib", "fusion", "web")
+PROGRAMS = ("camera_node", "calib", "fusion", "web", "roundel")
 
 
 def python_files(*folders: str) -> list[Path]:

@@ -18,9 +18,10 @@ from tests.conftest import ROOT
 
 PROBE = """
 import pathlib, sys
-import camera_node._core, camera_node.node.node, calib.rig.rig, fusion._core, fusion.client.arena
+import camera_node._core, camera_node.node.node, calib.rig.rig, fusion._core, roundel
+from roundel import Arena, Detector, track
 here = pathlib.Path(sys.argv[1])
-for module in (camera_node, camera_node._core, calib, fusion, fusion._core):
+for module in (camera_node, camera_node._core, calib, fusion, fusion._core, roundel):
     assert here in pathlib.Path(module.__file__).parents, module.__file__
 from camera_node.foundation.config import example_file
 assert here in example_file("demo/scene.yaml").parents
@@ -64,9 +65,11 @@ def test_a_wheel_contains_the_programs_only(wheel: Path):
         "calib",
         "fusion",
         "web",
+        "roundel",
     }
     assert not [name for name in names if name.endswith((".cpp", ".hpp"))]
     assert {"camera_node/_core.pyi", "fusion/_core.pyi"} <= set(names)
+    assert {"roundel/__init__.py", "roundel/py.typed"} <= set(names)
     assert "camera_node/configs/wand.yaml" in names
 
 

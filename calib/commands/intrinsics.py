@@ -2,7 +2,7 @@
 """`calib intrinsics`: calibrates lenses from views of a board."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.live import Live
@@ -59,11 +59,10 @@ class Intrinsics:
         rig = load_rig(self.out) if self.out.exists() else None
         lenses, faults = {}, []
         for views in self._collect_views():
-            suggested = views.compare_models(self.model)
             try:
-                lens = replace(views.solve(self.model), better_model=suggested)
+                lens = views.calibrate(self.model)
             except CalibrationError as error:
-                faults.append(f"{error}; {suggested}" if suggested else str(error))
+                faults.append(str(error))
                 continue
             lenses[views.camera] = lens
             print_lens(views.camera, lens)

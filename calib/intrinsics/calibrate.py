@@ -2,6 +2,7 @@
 """Calibrates a lens from views of a board (Zhang 2000): selects views, rejects outliers, and checks the result."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import msgspec
@@ -106,6 +107,14 @@ class BoardViews:
         lens_sigma = stated_sigma(adjusted.lens, np.sqrt(np.diag(adjusted.covariance)).tolist())
         camera = Camera(**msgspec.structs.asdict(adjusted.lens), lens_sigma=lens_sigma)
         return CalibratedLens(camera, adjusted, views, self.frames, rejected, coverage, sigma_px)
+
+    def calibrate(self, model: Model = "pinhole") -> CalibratedLens:
+        """As `solve`; the result, or the error, also says where the other model of a lens fits better."""
+        suggested = self.compare_models(model)
+        try:
+            return replace(self.solve(model), better_model=suggested)
+        except CalibrationError as error:
+            raise CalibrationError(f"{error}; {suggested}" if suggested else str(error)) from None
 
     def _is_mirrored(self) -> bool:
         """Whether most views show the board from behind, or it is found in most images without it once mirrored.

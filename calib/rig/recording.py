@@ -9,7 +9,7 @@ import io
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import cast
 
@@ -17,6 +17,7 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.writer import IndexType, Writer
 
+from calib.rig.camera import Camera
 from calib.rig.history import History
 from calib.rig.recording_repair import repair_recording
 from camera_node.foundation.errors import ConfigError
@@ -178,3 +179,12 @@ def read_detections(path: Path) -> list[Detections]:
     if not messages:
         raise ConfigError(f"{path} holds no detections; record with roundel record {path}")
     return messages
+
+
+def as_they_arrived(
+    messages: Iterable[Detections], cameras: Mapping[str, Camera]
+) -> list[tuple[int, Detections]]:
+    """Time of arrival (ns) and message in order, as if each arrived at its true capture time."""
+    offset_ns = {name: round(camera.time_offset_ms * 1e6) for name, camera in cameras.items()}
+    arrivals = [(message.t_ns + offset_ns.get(message.camera, 0), message) for message in messages]
+    return sorted(arrivals, key=lambda arrival: arrival[0])

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The rig: the cameras of an arena by name. Reads and writes `rig.yaml`."""
 
+from collections.abc import Iterator
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,10 +20,33 @@ INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")  # the fields that ever
 
 
 class Rig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Cameras by name, and what calibration reports of itself (free text and figures, for people and tools)."""
+    """The cameras of an arena, as in `rig.yaml`.
+
+        rig = Rig.load("rig.yaml")
+        print(rig["north"].T_world_cam)
+
+    Attributes:
+        cameras: lens, pose and clock of each camera, by name.
+        calibration: what calibration reports of itself (free text and figures, for people and tools).
+    """
 
     cameras: dict[str, Camera]
     calibration: dict[str, Any] = {}
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> "Rig":
+        """Read `rig.yaml`; cameras need intrinsics, poses are optional. Raises as `load_rig`."""
+        return load_rig(Path(path))
+
+    def save(self, path: str | PathLike[str]) -> Path | None:
+        """Write `rig.yaml`; returns the copy of the previous file, if there was one. Raises as `save_rig`."""
+        return save_rig(self, Path(path))
+
+    def __getitem__(self, name: str) -> Camera:
+        return self.cameras[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.cameras)
 
     def __post_init__(self) -> None:
         self.check()

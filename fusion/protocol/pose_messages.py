@@ -2,7 +2,9 @@
 """The server's messages over Zenoh, in the encoding of `camera_node.protocol.messages`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from os import PathLike
+from pathlib import Path
 from typing import Literal
 
 import msgspec
@@ -15,7 +17,7 @@ from camera_node.protocol.messages import VERSION, MessageError
 from camera_node.protocol.requests import RequestSource
 from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
-from fusion.model.robots import Robot
+from fusion.model.robots import Robot, load_robots, require_trackable, save_robots
 
 Vector = tuple[float, float, float]
 MAX_NUMBER = 1e5  # of a coordinate or velocity, in metres, m/s or rad/s
@@ -330,8 +332,34 @@ class RobotsRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class Robots(msgspec.Struct, frozen=True, kw_only=True):
-    """The robots that the server tracks, and the names whose changes a restart of the server would undo."""
+    """Robots by name: those of `robots.yaml`, or those that the server tracks.
+
+    Attributes:
+        robots: by name.
+        unsaved: names whose changes a restart of the server would undo.
+    """
 
     version: int = VERSION
     robots: dict[str, Robot]
     unsaved: tuple[str, ...] = ()
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> "Robots":
+        """Read `robots.yaml`.
+
+        Raises:
+            ConfigError: the file is missing or broken, or declares no robot.
+            FusionError: a constellation is symmetric, or two robots look alike.
+        """
+        return cls(robots=load_robots(Path(path)))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write `robots.yaml` atomically. Raises as `load`, and ConfigError if the folder is not writable."""
+        require_trackable(self.robots, str(path))
+        save_robots(self.robots, Path(path))
+
+    def __getitem__(self, name: str) -> Robot:
+        return self.robots[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.robots)

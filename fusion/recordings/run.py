@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib.rig.camera import Camera
+from calib.rig.recording import as_they_arrived
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import detect_frames, read_observations
@@ -100,9 +101,7 @@ def read_detections(
         messages = read_observations(observations, {name: (c.width, c.height) for name, c in cameras.items()})
     else:
         raise ConfigError("give either --frames FOLDER or --observations CSV")
-    offset_ns = {name: round(camera.time_offset_ms * 1e6) for name, camera in cameras.items()}
-    arrivals = [(message.t_ns + offset_ns.get(message.camera, 0), message) for message in messages]
-    return sorted(arrivals, key=lambda arrival: arrival[0])
+    return as_they_arrived(messages, cameras)
 
 
 def _synchronize(

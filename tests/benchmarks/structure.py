@@ -48,7 +48,7 @@ def is_record(node: ast.ClassDef) -> bool:
 
 def programs_of(root: Path) -> tuple[str, ...]:
     """The folders of program code of a checkout; older ones have no package `roundel`."""
-    return tuple(name for name in (*PROGRAMS, "roundel") if (root / name).exists())
+    return tuple(name for name in PROGRAMS if (root / name).exists())
 
 
 def measure(folders: tuple[str, ...]) -> dict[str, object]:
