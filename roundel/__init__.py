@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from camera_node.detection.detector import Detector
     from camera_node.foundation.errors import RoundelError
     from fusion.client.arena import Arena
-    from fusion.protocol.messages import Robots
+    from fusion.protocol.pose_messages import Robots
     from roundel.offline import calibrate_intrinsics, calibrate_wand, simulate, track
     from roundel.recorded import Recording
 
@@ -49,7 +49,7 @@ _MODULES = {
     "Detector": "camera_node.detection.detector",
     "Recording": "roundel.recorded",
     "Rig": "calib.rig.rig",
-    "Robots": "fusion.protocol.messages",
+    "Robots": "fusion.protocol.pose_messages",
     "RoundelError": "camera_node.foundation.errors",
     "calibrate_intrinsics": "roundel.offline",
     "calibrate_wand": "roundel.offline",

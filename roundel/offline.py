@@ -32,9 +32,9 @@ from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
-from fusion.protocol.messages import RobotPose, Robots
+from fusion.protocol.pose_messages import RobotPose, Robots
+from fusion.recordings.arena_recording import ArenaRecording, read_recording
 from fusion.recordings.frame_sets import recorded_frame_sets
-from fusion.recordings.record import ArenaRecording, read_recording
 from fusion.recordings.report import Summary
 from fusion.recordings.run import OfflineArena, fuse_frame_sets, fuse_recording
 from roundel.recorded import Recording

@@ -17,10 +17,10 @@ from camera_node.detection.detector import SettingKeywords
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
 from camera_node.protocol.messages import Detections, MessageError, decode
-from camera_node.sources.observations import detect_frames, read_observations
+from camera_node.sources.recorded_detections import detect_frames, read_observations
 from fusion.model.limits import Limits
-from fusion.protocol.messages import RobotPose, Robots
-from fusion.recordings.record import ArenaRecording
+from fusion.protocol.pose_messages import RobotPose, Robots
+from fusion.recordings.arena_recording import ArenaRecording
 from fusion.recordings.summary import summarize_recording
 
 if TYPE_CHECKING:
