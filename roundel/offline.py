@@ -34,9 +34,13 @@ from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import RobotPose, Robots
 from fusion.recordings.arena_recording import ArenaRecording, read_recording
-from fusion.recordings.frame_sets import recorded_frame_sets
-from fusion.recordings.report import Summary
-from fusion.recordings.run import OfflineArena, fuse_frame_sets, fuse_recording
+from fusion.recordings.offline_fusion import (
+    OfflineArena,
+    Summary,
+    fuse_frame_sets,
+    fuse_recording,
+    recorded_frame_sets,
+)
 from roundel.recorded import Recording
 
 log = logging.getLogger("roundel")

@@ -21,7 +21,7 @@ from camera_node.sources.recorded_detections import detect_frames, read_observat
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import RobotPose, Robots
 from fusion.recordings.arena_recording import ArenaRecording
-from fusion.recordings.summary import summarize_recording
+from fusion.recordings.recording_files import summarize_recording
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -16,7 +16,7 @@ import tyro
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.server_address import ServerAddress
 from fusion.client.arena import Arena
-from fusion.client.silence import cause_of_silence
+from fusion.client.streams import cause_of_silence
 from fusion.protocol.pose_messages import RobotPose
 
 log = logging.getLogger("fusion.bridge")

@@ -9,7 +9,7 @@ import tyro
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.session import open_client
-from fusion.client.define import RobotDefinition, define_robot, describe
+from fusion.client.robot_definition import RobotDefinition, define_robot, describe
 
 
 def define(

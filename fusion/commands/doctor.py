@@ -12,14 +12,16 @@ import tyro
 from camera_node.foundation.errors import RoundelError
 from camera_node.foundation.terminal import say
 from fusion.client.arena import Arena
-from fusion.diagnosis.arena import Observation, check_arena, observe
-from fusion.diagnosis.findings import Finding
-from fusion.diagnosis.machine import (
+from fusion.diagnosis.findings import (
+    Finding,
+    Observation,
+    check_arena,
     check_certificates,
     check_disk,
     check_files,
     check_listening,
     check_versions,
+    observe,
 )
 from fusion.server.arena_config import ArenaConfig, load_arena
 

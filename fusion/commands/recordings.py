@@ -6,8 +6,12 @@ from typing import Literal
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
-from fusion.recordings.files import remove_recording, rename_recording
-from fusion.recordings.summary import RecordingSummary, list_recordings
+from fusion.recordings.recording_files import (
+    RecordingSummary,
+    list_recordings,
+    remove_recording,
+    rename_recording,
+)
 
 USES = {"list": "[FOLDER]", "rename": "FILE NAME", "remove": "FILE..."}
 COUNTS = {"list": (0, 1), "rename": (2, 2), "remove": (1, 1000)}

@@ -5,12 +5,19 @@ from pathlib import Path
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say, track
+from fusion.export.pose_formats import write_csv
 from fusion.model.limits import Limits
 from fusion.recordings.arena_recording import read_recording
-from fusion.recordings.frame_sets import recorded_frame_sets
-from fusion.recordings.replay import cameras_of, robots_of, write_recording
-from fusion.recordings.report import Summary, write_poses
-from fusion.recordings.run import OfflineArena, fuse_frame_sets, fuse_recording
+from fusion.recordings.offline_fusion import (
+    OfflineArena,
+    Summary,
+    cameras_of,
+    fuse_frame_sets,
+    fuse_recording,
+    recorded_frame_sets,
+    robots_of,
+    write_recording,
+)
 
 
 def replay(
@@ -50,7 +57,7 @@ def replay(
     if out.suffix == ".mcap":
         write_recording(recording, out, fused)
     else:
-        write_poses(out, fused)
+        write_csv((pose for frame_set in fused for pose in frame_set.poses), out)
     for line in (*summary.lines(arena.robots), f"wrote {out}"):
         say(line)
     return 0

@@ -12,7 +12,7 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import open_client
-from fusion.client.define import LOST_AT_RESTART
+from fusion.client.robot_definition import LOST_AT_RESTART
 from fusion.model.robot_frame import move_origin, turn_heading
 from fusion.model.robots import Robot, save_robots
 from fusion.protocol.pose_messages import Robots, RobotsRequest

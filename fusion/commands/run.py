@@ -5,9 +5,9 @@ from pathlib import Path
 
 from calib.rig.rig import load_rig
 from camera_node.foundation.terminal import say, track
+from fusion.export.pose_formats import write_csv
 from fusion.model.robots import load_robots
-from fusion.recordings.report import Summary, write_poses
-from fusion.recordings.run import OfflineArena, fuse_recording, read_detections
+from fusion.recordings.offline_fusion import OfflineArena, Summary, fuse_recording, read_detections
 
 
 def run(
@@ -34,7 +34,8 @@ def run(
     cameras = load_rig(rig).require_placed(rig)
     arena = OfflineArena(cameras, load_robots(robots), rate_hz, smooth=smooth)
     messages, summary = read_detections(frames, observations, cameras), Summary()
-    write_poses(out, track(fuse_recording(messages, arena, summary), "fusing"))
+    fused = track(fuse_recording(messages, arena, summary), "fusing")
+    write_csv((pose for frame_set in fused for pose in frame_set.poses), out)
     for line in (*summary.lines(arena.robots), f"wrote {out}"):
         say(line)
     return 0

@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from camera_node.foundation.terminal import say
-from fusion.recordings.trim import trim_recording
+from fusion.recordings.recording_files import trim_recording
 
 
 def trim(recording: Path, out: Path, /, *, from_s: float = 0.0, to_s: float = 1e9) -> int:

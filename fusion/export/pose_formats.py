@@ -2,9 +2,11 @@
 """Writes poses and points in the formats of other programs. Files appear complete or not at all."""
 
 import contextlib
+import csv
+import io
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +19,11 @@ from fusion.bridges.ros2_messages import odometries, pose_stamped, transforms
 from fusion.bridges.ros2_node import ros_name
 from fusion.export.points import PointTrajectories
 from fusion.export.recorded_poses import RecordedPoses
-from fusion.recordings.report import write_pose_table
+from fusion.protocol.pose_messages import RobotPose
 
 MAX_FRAMES = 65535  # of a C3D file, whose counter has 16 bits
 MM = 1000.0
+COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
 
 
 @contextlib.contextmanager
@@ -42,9 +45,23 @@ def new_path(path: Path) -> Iterator[Path]:
         _remove(part)
 
 
-def write_csv(poses: RecordedPoses, path: Path) -> None:
-    """Write all poses, with those of lost robots, with the columns of `fusion replay`."""
-    write_pose_table(path, poses)
+def write_csv(poses: Iterable[RobotPose], path: Path) -> None:
+    """Write all poses, with those of lost robots, with `COLUMNS`.
+
+    Raises:
+        ConfigError: the folder can't be written to.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS.split(","))
+    writer.writerows(map(_row, poses))
+    write_atomically(path, text.getvalue())
+
+
+def _row(pose: RobotPose) -> list:
+    numbers = (*pose.position, *pose.quaternion_wxyz, *pose.velocity, *pose.angular_velocity)
+    digits = [f"{number:.7g}" for number in numbers]
+    return [pose.t_ns, pose.robot, *digits, pose.state, pose.n_markers, len(pose.cameras)]
 
 
 def write_tum(poses: RecordedPoses, path: Path) -> list[Path]:

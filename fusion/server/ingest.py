@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Decides which received frames are admitted. They come from a network and may contain anything.
+"""Decides which frames are admitted. They come from a network and may contain anything.
 
-Refused frames are counted by their reason. Time and memory stay bounded for any input.
+`admit` decides by the message and the rig alone, live and offline. `Ingest` is the live server's: it also refuses what
+depends on earlier messages and on the time of arrival, and counts what is refused by its reason. Time and memory stay
+bounded for any input.
 """
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -27,6 +31,37 @@ HISTORY = 64  # frames of a camera
 MIN_STEPS_BACK = 4
 ANOTHER_NODE = "frames of another node under its name"
 AXES_PX = 0.5, 1e5  # plausible axes of an outline
+Refusal = Literal["unknown camera", "wrong image size"]
+
+
+def admit(
+    message: Detections, cameras: Mapping[str, Camera], received_ns: int = 0
+) -> CalibratedFrame | Refusal:
+    """The calibrated frame of a message, or why it is refused.
+
+    Args:
+        message: of any camera.
+        cameras: the placed cameras of the rig.
+        received_ns: when it arrived; 0 offline.
+
+    Returns:
+        the frame with the parts that are used: plausible outlines, and at most `MAX_DETECTIONS` detections.
+    """
+    if (refused := refusal(message, cameras)) is not None:
+        return refused
+    frame = CalibratedFrame.of(message, cameras[message.camera], received_ns)
+    frame = replace(frame, roundels=_with_plausible_outlines(frame.roundels))
+    return _with_strongest(frame) if len(frame.roundels) > MAX_DETECTIONS else frame
+
+
+def refusal(message: Detections, cameras: Mapping[str, Camera]) -> Refusal | None:
+    """Why `admit` refuses a message; None if it does not."""
+    camera = cameras.get(message.camera)
+    if camera is None:
+        return "unknown camera"
+    if (message.width, message.height) != (camera.width, camera.height):
+        return "wrong image size"
+    return None
 
 
 @dataclass(slots=True)
@@ -67,22 +102,20 @@ class Ingest:
         message = self._decode(data, key, received_ns)
         if message is None:
             return None
-        name, camera = message.camera, cameras.get(message.camera)
-        if not self._is_admitted(name, camera is not None):
+        name, refused = message.camera, refusal(message, cameras)
+        if not self._has_room(name, name in cameras):
             return self._refuse("too many cameras")
-        has_size = camera is None or (message.width, message.height) == (camera.width, camera.height)
-        if has_size and not self._publishers.admits(message, received_ns):
+        if refused != "wrong image size" and not self._publishers.admits(message, received_ns):
             return self._refuse(ANOTHER_NODE, name)
         self._statistics.count_arrival(name, message.t_ns, received_ns)
-        if camera is None:
-            return self._refuse("unknown camera", name) if cameras else None
-        if not has_size:
-            return self._refuse("wrong image size", name)
+        if refused is not None:
+            return self._refuse(refused, name) if cameras else None
         if not self._is_new(message):
             return self._refuse("duplicate frame", name)
         if len(message) > MAX_DETECTIONS:
             self._statistics.count_fault("frames with too many roundels", name)
-        return sanitized(CalibratedFrame.of(message, camera, received_ns))
+        admitted = admit(message, cameras, received_ns)
+        return admitted if isinstance(admitted, CalibratedFrame) else None
 
     def _decode(self, data: bytes, key: str, received_ns: int) -> Detections | None:
         """The message, if its content, its camera and its time are possible."""
@@ -102,7 +135,7 @@ class Ingest:
     def _refuse(self, reason: str, camera: str | None = None) -> None:
         self._statistics.count_fault(reason, camera)
 
-    def _is_admitted(self, name: str, is_calibrated: bool) -> bool:
+    def _has_room(self, name: str, is_calibrated: bool) -> bool:
         """Whether the camera is in the rig, or there is room for another one that is not."""
         if is_calibrated:
             self._calibrated.add(name)
@@ -127,12 +160,6 @@ class Ingest:
         has_two = self._publishers.is_contested(message.camera) or sum(history.steps_back) >= MIN_STEPS_BACK
         self._statistics.note_publishers(message.camera, has_two)
         return True
-
-
-def sanitized(frame: CalibratedFrame) -> CalibratedFrame:
-    """The frame with the parts that are used: plausible outlines, and at most `MAX_DETECTIONS` detections."""
-    frame = replace(frame, roundels=_with_plausible_outlines(frame.roundels))
-    return _with_strongest(frame) if len(frame.roundels) > MAX_DETECTIONS else frame
 
 
 def _with_plausible_outlines(roundels: Roundels) -> Roundels:

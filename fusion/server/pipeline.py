@@ -3,6 +3,7 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from calib.rig.camera import Camera
@@ -13,15 +14,15 @@ from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
 from fusion.model.corrections import corrected_camera
 from fusion.model.frames import CalibratedFrame
-from fusion.model.robots import Robot, changed, load_robots, load_saved_robots, save_robots
-from fusion.monitoring.clocks.camera_clocks import ClockHealth
+from fusion.model.robots import Robot
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.pose_messages import RobotsRequest, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.server.server_statistics import PipelineStatus
 from fusion.server.storage.active_rig import ActiveRig
-from fusion.server.storage.persistence import PersistedFile
+from fusion.server.storage.active_robots import ActiveRobots
 from fusion.tracking.association import AssociatedFrames
 from fusion.tracking.tracker import Tracker
 
@@ -48,9 +49,8 @@ class TrackingPipeline:
         self._config, self._shard = config, shard
         rig, saved_rig = (Path(file) if file else None for file in (config.rig, config.saved_rig))
         self.active_rig = ActiveRig(rig, saved_rig)
-        self._saved_robots = PersistedFile("robots", config.saved_robots, load_saved_robots, save_robots)
-        self.robots = self._load_robots()
-        self._durable_robots = self.robots  # those that a restart would load
+        saved_robots = Path(config.saved_robots) if config.saved_robots else None
+        self.active_robots = ActiveRobots(Path(config.robots), saved_robots)
         self.tracker: Tracker | None
         self.synchronizer: FrameSynchronizer
         self.early: AssociatedFrames | None = None  # of the open frame set
@@ -60,18 +60,15 @@ class TrackingPipeline:
         if self.tracker is not None:
             self.tracker.monitors.extrinsics.remember(rig.placed() for rig in self.active_rig.earlier())
 
-    def _load_robots(self) -> dict[str, Robot]:
-        """The newer of the given and the saved robots; if both are one file, it may be missing or empty."""
-        given = Path(self._config.robots)
-        if self._config.saved_robots == self._config.robots:
-            return load_saved_robots(given) if given.exists() else {}
-        saved = self._saved_robots.load_if_newer(given)
-        return load_robots(given) if saved is None else saved
-
     @property
     def cameras(self) -> dict[str, Camera]:
         """The cameras that have a pose in the active rig."""
         return self.active_rig.rig.placed() if self.active_rig.rig else {}
+
+    @property
+    def robots(self) -> dict[str, Robot]:
+        """The robots that are tracked."""
+        return self.active_robots.robots
 
     def restart(self) -> None:
         """Drop all frames and tracks; the tracker acquires all robots again, with the clocks as they are known."""
@@ -180,26 +177,12 @@ class TrackingPipeline:
         Raises:
             ConfigError, FusionError: the request is invalid.
         """
-        robots = changed(self.robots, request.rename, request.remove, request.define, request.replace)
-        if robots == self.robots:
+        before = self.robots
+        if not self.active_robots.change(request):
             return set()
-        removed = self.robots.keys() - robots.keys()
-        self.robots = robots
-        if self._saved_robots.save(robots):
-            self._durable_robots = robots
-        log.info("robots: %s", ", ".join(robots) or "none")
-        if unsaved := self.unsaved_robots():
-            log.warning(
-                "a restart undoes the changes of %s: arena.yaml names no saved_robots", ", ".join(unsaved)
-            )
         if self.tracker is not None:
-            self.tracker = self.tracker.with_robots(robots, request.rename)
-        return removed
-
-    def unsaved_robots(self) -> tuple[str, ...]:
-        """Names of the robots that a restart would lose, change or bring back."""
-        names = sorted(self.robots.keys() | self._durable_robots.keys())
-        return tuple(name for name in names if self.robots.get(name) != self._durable_robots.get(name))
+            self.tracker = self.tracker.with_robots(self.robots, request.rename)
+        return before.keys() - self.robots.keys()
 
     def pause_acquisition(self, is_wand_recorded: bool) -> None:
         """Acquire no robots while a wand is recorded: its markers are none. Tracked robots continue."""
@@ -228,30 +211,28 @@ class TrackingPipeline:
         """A frame in corrected time; None while its camera is withheld, or if it is in the future."""
         return self.tracker.admit(frame) if self.tracker else frame
 
-    def clocks(self) -> dict[str, ClockHealth]:
-        """The clocks of the cameras."""
-        return self.tracker.monitors.clocks.health() if self.tracker else {}
-
     def withheld_cameras(self) -> set[str]:
         """Cameras whose frames are not used: their clocks are unknown, or their images frozen."""
         return self.tracker.monitors.withheld if self.tracker else set()
 
-    def excluded_cameras(self) -> set[str]:
-        """Cameras that were moved, whose detections are excluded."""
-        return set(self.tracker.monitors.extrinsics.excluded) if self.tracker else set()
-
-    def frozen_cameras(self) -> set[str]:
-        """Cameras that repeat an old image."""
-        return self.tracker.monitors.frozen.names if self.tracker else set()
-
-    def not_acquired(self) -> dict[str, str]:
-        """Why the robots that are neither tracked nor coasting were not acquired, by name."""
-        return self.tracker.not_acquired() if self.tracker else dict.fromkeys(self.robots, NOT_CALIBRATED)
-
-    def geometry_residuals_px(self) -> dict[str, float]:
-        """RMS residuals of the robots whose markers are not at the declared places."""
-        return self.tracker.geometry.misfits() if self.tracker else {}
-
-    def measured_diameters_m(self) -> dict[str, float]:
-        """Measured diameters of the discs of robots that declare another one."""
-        return self.tracker.sizes.misfits() if self.tracker else {}
+    def status(self) -> PipelineStatus:
+        """The pipeline's part of the server's status."""
+        message, tracker = self.active_rig.message, self.tracker
+        general = PipelineStatus(
+            limits=self._config.limits,
+            rig_t_ns=message.t_ns if message else None,
+            not_acquired=dict.fromkeys(self.robots, NOT_CALIBRATED),
+            unsaved_robots=self.active_robots.unsaved(),
+        )
+        if tracker is None:
+            return general
+        return replace(
+            general,
+            calibrated=frozenset(self.cameras),
+            excluded=frozenset(tracker.monitors.extrinsics.excluded),
+            frozen=frozenset(tracker.monitors.frozen.names),
+            clocks=tracker.monitors.clocks.health(),
+            geometry_residuals_px=tracker.geometry.misfits(),
+            measured_diameters_m=tracker.sizes.misfits(),
+            not_acquired=tracker.not_acquired(),
+        )

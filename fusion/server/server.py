@@ -8,13 +8,15 @@ import contextlib
 import gc
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+
+import msgspec
 
 from calib.rig.messages import RigMessage
 from camera_node.foundation.logs import about
 from camera_node.foundation.service import ServiceManager
-from camera_node.protocol.messages import Keys, MessageError, decode
+from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.session import listening_endpoints
 from camera_node.protocol.tcp_sockets import stop_lingering
 from fusion.errors import FusionError
@@ -22,18 +24,26 @@ from fusion.model.frames import FrameSet
 from fusion.model.undistortion import prepare_lenses
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.arena_health import describe_status
-from fusion.protocol.pose_messages import FusionStatus, ShardPoses, TrackingState, shard_key
+from fusion.protocol.pose_messages import (
+    FusedFrames,
+    FusionStatus,
+    Latency,
+    RobotPose,
+    RobotPoses,
+    ShardPoses,
+    TrackingState,
+    frames_key,
+    shard_key,
+)
 from fusion.protocol.shards import Shard
 from fusion.server.arena_config import ArenaConfig
-from fusion.server.camera_requests import CameraRequests
-from fusion.server.frame_quotas import FrameQuotas
+from fusion.server.arena_queries import ArenaQueries, CameraQueries
+from fusion.server.fair_use import FrameQuotas
 from fusion.server.frame_synchronizer import MAX_RATE_HZ
 from fusion.server.ingest import MAX_AGE_NS, Ingest
 from fusion.server.pipeline import TrackingPipeline
-from fusion.server.publisher import ArenaPublisher
-from fusion.server.requests import RequestHandlers
 from fusion.server.server_clock import clock_of
-from fusion.server.server_statistics import PipelineStatus, ServerStatistics
+from fusion.server.server_statistics import ServerStatistics
 from fusion.server.storage.audit import AuditLog
 from fusion.server.storage.camera_registry import CameraRegistry
 from fusion.server.transport import INTERNAL_ERROR, Transport, open_session
@@ -83,7 +93,6 @@ class Server:
             self.clock = clock_of(self.shard, self.session, self.keys)
             stack.callback(self.clock.close)
             self.transport = Transport(self.session, self.clock, self._count_fault, stack)
-            self._publisher = ArenaPublisher(self.transport, self.keys, self.shard)
             self._declare()
             self._closing = stack.pop_all()
         verb = "listens on" if self.shard.leads else f"connects its shard {self.config.shard} to"
@@ -123,14 +132,13 @@ class Server:
         if self.shard.count > 1:
             transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
         audit = AuditLog(self.config.audit if self.shard.leads else None, self.session)
-        requests = RequestHandlers(keys, self.pipeline, self._publisher, self.clock, self._update_quotas)
-        requests.declare(transport, audit)
+        queries = ArenaQueries(keys, self.pipeline, transport, self.clock, self._update_quotas)
+        queries.declare(audit)
         if self.shard.leads:
-            requests.declare_rig(transport, audit)
+            queries.declare_rig(audit)
             registry = CameraRegistry(Path(self.config.cameras) if self.config.cameras else None)
             retire = self.statistics.retire
-            cameras = CameraRequests(keys.arena, registry, self.pipeline, self._publisher, self.clock, retire)
-            cameras.declare(transport, audit)
+            CameraQueries(keys, registry, self.pipeline, transport, self.clock, retire).declare(audit)
             transport.declare_alive(keys.fusion_alive)
         else:
             transport.subscribe(keys.rig, self._follow_rig, _prepare_lenses)
@@ -181,14 +189,16 @@ class Server:
         predicted = tracker.predict(frame_set.t_ns, self.pipeline.early)
         update = tracker.update(tracker.associate(predicted, frame_set), frame_set)
         latency = latency_of(frame_set, start_ns, self.clock.now_ns())
-        self._publisher.publish_poses(update.poses.values(), latency)
+        publish_poses(self.transport, self.keys, update.poses.values(), latency)
         if self.shard.count > 1:
-            self._publisher.publish_shard(tracker.table.shard_poses())
+            self.transport.publish(shard_key(self.keys.arena, self.shard.index), tracker.table.shard_poses())
         result = tracker.finish(update)
         published = {pose.robot for pose in update.poses.values()}
-        self._publisher.publish_poses([p for p in result.poses if p.robot not in published], latency)
-        self._publisher.publish_markers(result.markers)
-        self._publisher.publish_frames(frame_set)
+        others = [pose for pose in result.poses if pose.robot not in published]
+        publish_poses(self.transport, self.keys, others, latency)
+        if self.shard.leads:
+            self.transport.publish(self.keys.markers, result.markers)
+            self.transport.publish(frames_key(self.keys.arena), FusedFrames.of(frame_set))
         for correction in tracker.check_extrinsics(frame_set, result):
             self._report_correction(correction)
         for name in result.crowded:
@@ -203,7 +213,7 @@ class Server:
             return
         self.pipeline.correct_rig(correction, self.clock.now_ns())
         if self.pipeline.active_rig.message is not None:
-            self._publisher.publish_rig(self.pipeline.active_rig.message)
+            self.transport.publish(self.keys.rig, self.pipeline.active_rig.message)
         if correction.has_returned:
             change = "camera %s is at a known pose, and used again"
         else:
@@ -214,20 +224,9 @@ class Server:
         """Publish the status once a second; return it if it was due."""
         if not self.statistics.is_due(now_ns):
             return None
-        pipeline = PipelineStatus(
-            limits=self.config.limits,
-            calibrated=frozenset(self.pipeline.cameras),
-            excluded=frozenset(self.pipeline.excluded_cameras()),
-            frozen=frozenset(self.pipeline.frozen_cameras()),
-            clocks=self.pipeline.clocks(),
-            rig_t_ns=self.pipeline.active_rig.message.t_ns if self.pipeline.active_rig.message else None,
-            geometry_residuals_px=self.pipeline.geometry_residuals_px(),
-            measured_diameters_m=self.pipeline.measured_diameters_m(),
-            not_acquired=self.pipeline.not_acquired(),
-            unsaved_robots=self.pipeline.unsaved_robots(),
-        )
-        status = self.statistics.report(now_ns, pipeline)
-        self._publisher.publish_status(status)
+        status = self.statistics.report(now_ns, self.pipeline.status())
+        key = self.keys.fusion_status + ("" if self.shard.leads else f"/{self.shard.index}")
+        self.transport.publish(key, status)
         self._update_quotas()
         return status
 
@@ -279,6 +278,17 @@ class Server:
             self.statistics.count_fault("implausible time")
         else:
             self.pipeline.add_shard_poses(poses)
+
+
+def publish_poses(
+    transport: Transport, keys: Keys, poses: Iterable[RobotPose], latency: Latency | None
+) -> None:
+    """Publish poses, each with the latency of its frame set: all in one message, and each on its robot's key."""
+    encoded = {pose.robot: encode(msgspec.structs.replace(pose, latency=latency)) for pose in poses}
+    if encoded:
+        transport.put(keys.poses, RobotPoses.join(tuple(encoded.values())))
+    for robot, data in encoded.items():
+        transport.put(keys.robot_pose(robot), data)
 
 
 def _prepare_lenses(data: bytes) -> None:

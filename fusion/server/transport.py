@@ -21,10 +21,8 @@ from camera_node.protocol.requests import REQUEST_S, payload_of, respond
 from camera_node.protocol.session import has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
 from fusion.server.arena_config import ArenaConfig
-from fusion.server.frame_quotas import FrameQuotas
-from fusion.server.preparation import Preparation
+from fusion.server.fair_use import FrameQuotas, Preparation, Task, TaskQueue
 from fusion.server.server_clock import ServerClock
-from fusion.server.task_queue import Task, TaskQueue
 
 log = logging.getLogger("fusion")
 MESSAGES = 256  # queued, of one key that is not a camera's

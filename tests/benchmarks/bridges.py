@@ -27,8 +27,7 @@ from camera_node.protocol.messages import Keys
 from camera_node.protocol.session import open_client, open_router
 from fusion.client.arena import Arena
 from fusion.protocol.pose_messages import RobotPose
-from fusion.protocol.shards import Shard
-from fusion.server.publisher import ArenaPublisher
+from fusion.server.server import publish_poses
 from fusion.server.server_clock import ServerClock
 from fusion.server.transport import Transport
 from tests.conftest import ROOT, free_port
@@ -61,7 +60,6 @@ def publish(endpoint: str) -> None:
     """Publish all robots' poses in each frame set by the server's own code, until killed."""
     with open_router([endpoint]) as session, ExitStack() as closing:
         transport = Transport(session, ServerClock(), lambda reason, key: None, closing)
-        publisher = ArenaPublisher(transport, Keys(ARENA), Shard())
         poses = [moving_pose(f"robot{k:02}", 0, seed=k) for k in range(ROBOTS)]
         begun_ns, k = time.time_ns(), 0
         while True:
@@ -69,7 +67,7 @@ def publish(endpoint: str) -> None:
             t_ns = begun_ns + k * 1_000_000_000 // RATE_HZ
             stamped = [msgspec.structs.replace(pose, t_ns=t_ns) for pose in poses]
             time.sleep(max(0.0, (t_ns - time.time_ns()) * 1e-9))
-            publisher.publish_poses(stamped, None)
+            publish_poses(transport, Keys(ARENA), stamped, None)
 
 
 @contextmanager

@@ -12,8 +12,7 @@ from calib.rig.camera import Camera
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from fusion.protocol.pose_messages import RobotPose
-from fusion.recordings.report import Summary
-from fusion.recordings.run import OfflineArena, fuse_recording
+from fusion.recordings.offline_fusion import OfflineArena, Summary, fuse_recording
 from tests.benchmarks.fusion_load import START_NS, Load
 
 StampError = Callable[[float], float]  # of a camera's stamps, s, at the true time in s

@@ -13,7 +13,7 @@ import pytest
 from calib.rig.recording import RecordingWriter
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Keys, encode
-from fusion.recordings.report import write_pose_table
+from fusion.export.pose_formats import write_csv
 from roundel import (
     Recording,
     Rig,
@@ -150,7 +150,7 @@ def test_the_poses_of_a_recorded_server_are_repeated(tmp_path: Path):
     path = ROOT / "docs" / "sample.mcap"
     roundel("replay", str(path), "--out", "replayed.csv", folder=tmp_path)
     poses = list(track(path))
-    write_pose_table(tmp_path / "tracked.csv", poses)
+    write_csv(poses, tmp_path / "tracked.csv")
     assert (tmp_path / "tracked.csv").read_text() == (tmp_path / "replayed.csv").read_text()
     published = {(pose.robot, pose.t_ns): pose.position for pose in Recording(path).poses()}
     again = {(pose.robot, pose.t_ns): pose.position for pose in poses}

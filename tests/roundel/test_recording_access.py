@@ -14,8 +14,8 @@ import pytest
 
 from calib.rig.recording import RecordingWriter, read_messages
 from camera_node.foundation.errors import ConfigError
+from fusion.export.pose_formats import COLUMNS
 from fusion.recordings.arena_recording import read_recording
-from fusion.recordings.report import COLUMNS
 from roundel import Recording
 from tests.conftest import ROOT
 

@@ -15,7 +15,7 @@ from playwright.sync_api import Locator
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.connection import ServerConnection
 from fusion.commands.recordings import recordings
-from fusion.recordings.summary import list_recordings
+from fusion.recordings.recording_files import list_recordings
 from tests.conftest import ROOT
 from tests.fusion.unknown_robot import serving_an_unknown_robot
 from tests.waiting import wait_for

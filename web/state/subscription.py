@@ -18,7 +18,7 @@ from camera_node.protocol.camera_requests import request_settings
 from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.requests import RequestSource
-from fusion.client.measure import collect_markers
+from fusion.client.robot_definition import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusionStatus, Markers, Robots, RobotsRequest
 from fusion.protocol.robot_requests import change_robots, reframe_robot, request_robots

@@ -7,8 +7,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import require_name
-from fusion.client.define import describe
-from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
+from fusion.client.robot_definition import (
+    StationaryMarkers,
+    describe,
+    find_stationary_markers,
+    robot_from_markers,
+)
 from fusion.errors import FusionError
 from web.colours import SELECTED
 from web.condition import next_step

@@ -11,8 +11,13 @@ import viser
 from calib.rig.recording import RecordingWriter
 from camera_node.foundation.errors import ConfigError, RoundelError
 from fusion.recordings.arena_recording import ArenaRecorder
-from fusion.recordings.files import recording_path, remove_recording, rename_recording
-from fusion.recordings.summary import RecordingSummary, list_recordings
+from fusion.recordings.recording_files import (
+    RecordingSummary,
+    list_recordings,
+    recording_path,
+    remove_recording,
+    rename_recording,
+)
 from web.commands import run_program
 from web.errors import WebError
 from web.html_tables import Column, HtmlTable, TableRow

@@ -22,7 +22,6 @@ from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError, RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.model.corrections import correct, is_corrected
-from fusion.server.storage.persistence import is_newer
 
 log = logging.getLogger("fusion")
 State = Literal["earlier", "in force", "undone"]
@@ -230,3 +229,8 @@ class ActiveRig:
             return
         yield self._saved
         yield from reversed(self._history.older())
+
+
+def is_newer(given: Path | None, saved: Path) -> bool:
+    """Whether the user wrote the file `given` after the server wrote the file `saved`."""
+    return given is not None and given.exists() and given.stat().st_mtime >= saved.stat().st_mtime

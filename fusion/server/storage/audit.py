@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Notes who changed the rig and the robots: a line in the log, and in a file."""
+"""Notes who changed the rig and the robots: a line in the log, and in a file that is forced to the disk and bounded."""
 
+import contextlib
 import logging
+import os
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +16,6 @@ from camera_node.foundation.errors import RoundelError
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.foundation.text import printable
 from camera_node.protocol.requests import RequestSource, payload_of, sender_of
-from fusion.server.storage.audit_file import AuditFile
 
 log = logging.getLogger("fusion.audit")
 Answer = Callable[[zenoh.Query], bytes]
@@ -25,6 +26,8 @@ DEPTH = 2  # of a request that a line quotes
 MAX_QUOTED = 4000  # bytes of a request in a line
 # Of refused requests, which anybody may send: 4 MB a day at 500 bytes, so that the files hold the changes of weeks.
 REFUSED_HZ, REFUSED_BURST = 0.1, 20
+MAX_BYTES = 10_000_000  # of one file
+MAX_OLD = 9  # files before it: `audit.jsonl.1` is the newest of them
 
 
 class AuditLog:
@@ -124,3 +127,44 @@ def _outline(value: Any, depth: int) -> Any:
     if isinstance(value, dict | list):
         return [str(entry)[:MAX_TEXT] for entry in list(value)[:MAX_ENTRIES]]
     return value[:MAX_TEXT] if isinstance(value, str) else value if isinstance(value, int | float) else None
+
+
+class AuditFile:
+    """Appends lines and forces them to the disk.
+
+    A file that would exceed `max_bytes` becomes `<name>.1`, that one `<name>.2` and so on.
+
+    Args:
+        path: of the present file.
+        max_bytes: of each file; a longer line has a file of its own.
+
+    Attributes:
+        path: as given.
+
+    All methods raise OSError if the disk refuses.
+    """
+
+    def __init__(self, path: Path, max_bytes: int = MAX_BYTES) -> None:
+        self.path, self._max_bytes = path, max_bytes
+
+    def append(self, line: bytes) -> None:
+        """Append a line without its line feed, and force it to the disk."""
+        line += b"\n"
+        with contextlib.suppress(FileNotFoundError):
+            if self.path.stat().st_size + len(line) > self._max_bytes:
+                self._rotate()
+        handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
+        try:
+            os.write(handle, line)
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+    def _rotate(self) -> None:
+        """Renaming replaces the oldest file; each step is atomic."""
+        for number in range(MAX_OLD, 0, -1):
+            with contextlib.suppress(FileNotFoundError):
+                os.replace(self._old(number - 1), self._old(number))
+
+    def _old(self, number: int) -> Path:
+        return self.path.with_name(f"{self.path.name}.{number}") if number else self.path

@@ -16,7 +16,6 @@ from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, decode, encode
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
 from fusion.server.arena_config import ArenaConfig
-from fusion.server.publisher import ArenaPublisher
 from fusion.server.server import Server
 from tests.benchmarks.faults.camera import SceneCamera, SceneDetector
 from tests.benchmarks.faults.judge import PoseJudge
@@ -140,8 +139,7 @@ class VirtualArena:
         Path(robots).write_bytes(msgspec.yaml.encode({"robots": bodies}))
         server = Server(ArenaConfig(arena=ARENA, rig=rig, saved_rig=saved, robots=robots))
         server.clock = self.clock  # pyright: ignore[reportAttributeAccessIssue]
-        outbox = Outbox(self.judge)
-        server._publisher = ArenaPublisher(outbox, self._keys, server.shard)  # pyright: ignore[reportArgumentType]
+        server.transport = Outbox(self.judge)  # pyright: ignore[reportAttributeAccessIssue]
         return server
 
     def _schedule(self, name: str, seq: int) -> None:

@@ -73,7 +73,7 @@ def test_an_invalid_definition_is_reported_in_one_line(words, said):
 
 LIGHT = """
 import sys
-import fusion.__main__, fusion.client.arena, fusion.client.define
+import fusion.__main__, fusion.client.arena, fusion.client.robot_definition
 import fusion.commands.define, fusion.commands.bridges.ros2, fusion.commands.history
 heavy = {"gtsam", "scipy", "viser", "mcap", "fusion.server", "fusion.tracking"} & set(sys.modules)
 sys.exit(", ".join(sorted(heavy)) or 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
-from fusion.client.measure import StationaryMarkers, find_stationary_markers, robot_from_markers
+from fusion.client.robot_definition import StationaryMarkers, find_stationary_markers, robot_from_markers
 from fusion.errors import FusionError
 from fusion.model.likeness import distances
 from fusion.model.robots import Robot, load_robots, require_distinct

@@ -7,8 +7,7 @@ import pytest
 
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.connection import ServerConnection
-from fusion.client.silence import cause_of_silence
-from fusion.client.streams import RobotStream
+from fusion.client.streams import RobotStream, cause_of_silence
 from tests.conftest import free_port
 from tests.fusion.serving import config, serving
 from tests.waiting import wait_for

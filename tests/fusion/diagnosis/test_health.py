@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from calib.rig.rig import Rig
-from fusion.diagnosis.machine import check_certificates, check_disk, check_listening, check_rig
+from fusion.diagnosis.findings import check_certificates, check_disk, check_listening, check_rig
 from fusion.protocol.arena_health import assess_calibration
 from fusion.server.arena_config import ArenaConfig
 from tests.conftest import ROOT, free_port

@@ -13,7 +13,7 @@ import zenoh
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import decode, encode
 from camera_node.protocol.session import open_client, open_router
-from fusion.client.define import LOST_AT_RESTART
+from fusion.client.robot_definition import LOST_AT_RESTART
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots
 from fusion.protocol.pose_messages import Robots, RobotsRequest, robots_key, set_robots_key

@@ -20,7 +20,7 @@ from fusion.commands.replay import replay
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import Robots
 from fusion.recordings.arena_recording import ArenaRecorder, read_recording
-from fusion.recordings.run import OfflineArena, fuse_recording
+from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
 from tests.fusion.serving import ARENA, KEYS, config, live, run_program, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line

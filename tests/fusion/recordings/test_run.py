@@ -14,8 +14,8 @@ import pytest
 from calib.rig.rig import Rig, save_rig
 from camera_node.sources.recorded_detections import write_observations
 from fusion.commands.run import run
+from fusion.export.pose_formats import COLUMNS
 from fusion.model.robots import Robot
-from fusion.recordings.report import COLUMNS
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
 from tests.truth import true_camera
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fusion.protocol.pose_messages import RobotPose
-from fusion.server.frame_quotas import FRAMES_PER_SET
+from fusion.server.fair_use import FRAMES_PER_SET
 from fusion.server.transport import ABOVE_QUOTA
 from tests.fusion.traffic import (
     HZ,

@@ -32,10 +32,10 @@ def test_a_restart_of_tracking_keeps_the_corrections_of_clocks(tmp_path: Path):
     """Before: every frame set without a solution made the stamps of a corrected camera wrong again."""
     pipeline = TrackingPipeline(config(tmp_path), Shard())
     with_a_clock_that_jumped(pipeline)
-    before = pipeline.clocks()
+    before = pipeline.status().clocks
     assert before["cam0"].state != "correct"
     pipeline.restart()
-    assert pipeline.clocks() == before
+    assert pipeline.status().clocks == before
 
 
 def test_a_rig_with_another_camera_without_a_pose_changes_no_track(tmp_path: Path):

@@ -22,7 +22,7 @@ from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from fusion.protocol.pose_messages import FusedFrames, frames_key
 from fusion.server.arena_config import ArenaConfig
-from fusion.server.requests import RIG_ANSWERS_HZ
+from fusion.server.arena_queries import RIG_ANSWERS_HZ
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port
 from tests.fusion.serving import (

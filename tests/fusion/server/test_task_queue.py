@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The server's queue: each sender has its own limit, and requests take a bounded share of the time."""
 
-from fusion.server.task_queue import Task, TaskQueue
+from fusion.server.fair_use import Task, TaskQueue
 from tests.waiting import poll
 
 

@@ -16,8 +16,7 @@ from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.protocol.pose_messages import RobotsRequest
 from fusion.protocol.robot_requests import change_robots
-from fusion.server.storage.audit import REFUSED_BURST, quote
-from fusion.server.storage.audit_file import MAX_OLD, AuditFile
+from fusion.server.storage.audit import MAX_OLD, REFUSED_BURST, AuditFile, quote
 from tests.conftest import ROOT
 from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import WIDE

@@ -10,17 +10,24 @@ import queue
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
+import msgspec
 import numpy as np
 import zenoh
 from numpy.typing import ArrayLike
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Keys, MessageError, decode
+from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
+from fusion.model.likeness import distances
 from fusion.model.robots import MotionModel, Robot
-from fusion.protocol.pose_messages import Markers
+from fusion.protocol.pose_messages import Markers, Robots, RobotsRequest
+from fusion.protocol.robot_requests import change_robots, request_robots
 
 SAME_M = 0.02  # the largest distance of one stationary marker's positions in two messages
 STATIONARY_M = 0.005  # the largest median distance of a stationary marker from its median position
@@ -30,6 +37,8 @@ MAX_SIZE_ERROR = 0.1
 PLANAR_M = 0.005  # markers within this of a plane show the robot's z axis better than their normals
 SIDES_RAD = math.radians(45)  # between normals of different sides; several sigma of a measured one
 OFF_CENTRE_M = 0.02  # the first marker this far from the centre defines the x axis
+Rows = tuple[tuple[float, float, float], ...]
+LOST_AT_RESTART = "a restart of the server loses it, because arena.yaml names no saved_robots"
 
 
 @dataclass(frozen=True)
@@ -163,9 +172,6 @@ def _mean_direction(normals: Array) -> Array:
     return total / np.linalg.norm(total) if np.any(total) else np.full(3, np.nan)
 
 
-Rows = tuple[tuple[float, float, float], ...]
-
-
 def _in_body(markers: StationaryMarkers) -> tuple[Rows, Rows]:
     """Positions, to a tenth of a millimetre, and normals in the robot's own frame; no normals if all are +z."""
     centred = markers.position - markers.position.mean(0)
@@ -228,3 +234,61 @@ def _z_axis(centred: Array, normals: Array) -> Array:
         z = axes[2] if len(centred) >= 3 else np.array([0.0, 0.0, 1.0])
         return -z if z @ (facing if is_known else [0.0, 0.0, 1.0]) < 0 else z
     return facing
+
+
+@dataclass(frozen=True)
+class RobotDefinition:
+    """What the user specifies about a robot.
+
+    Attributes:
+        name: the robot's name.
+        diameter_m: of its roundels' black discs.
+        motion: how it moves.
+        centre: its rough position, world, metres; None if it has all unlabeled markers.
+        radius_m: the largest distance of its markers from there.
+        replace: whether it may replace a robot of that name.
+
+    Raises:
+        ConfigError: the name can't be one.
+    """
+
+    name: str
+    diameter_m: float
+    motion: Literal["ground", "aerial"] = "aerial"
+    centre: tuple[float, float, float] | None = None
+    radius_m: float = 0.3
+    replace: bool = False
+
+    def __post_init__(self) -> None:
+        require_name(self.name, "a robot")
+
+
+def define_robot(session: zenoh.Session, arena: str, definition: RobotDefinition, seconds: float) -> Robots:
+    """Measure a robot for `seconds`, and add it to the robots of the running server, which it returns.
+
+    Raises:
+        ConfigError: there is a robot of that name.
+        FusionError: the markers make no robot, or the server refuses it.
+        NetworkError: no server answers in time.
+    """
+    existing = request_robots(session, arena).robots  # fails without a server, before the measurement
+    if definition.name in existing and not definition.replace:
+        raise ConfigError(f"there is another robot '{definition.name}': add --replace, or use another name")
+    markers = find_stationary_markers(collect_markers(session, arena, seconds))
+    if definition.centre is not None:
+        markers = markers.within(definition.centre, definition.radius_m)
+    robot = robot_from_markers(markers, definition.diameter_m, definition.motion)
+    source = RequestSource.of("fusion define")
+    request = RobotsRequest(define={definition.name: robot}, replace=definition.replace, source=source)
+    return change_robots(session, arena, request)
+
+
+def describe(name: str, robots: Robots) -> str:
+    """The measured robot in words, and as an entry for robots.yaml."""
+    robot = robots.robots[name]
+    D = distances(robot.points)
+    pairs = ", ".join(f"{i}-{j} {D[i, j] * 1e3:.1f}" for i, j in combinations(range(len(D)), 2))
+    defined = f"the server now tracks {name}, with {len(D)} marker{'s' * (len(D) > 1)}"
+    entry = msgspec.json.encode({name: robot}).decode()[1:-1].replace('":', '": ').replace(",", ", ")
+    lost = f"; {LOST_AT_RESTART}" if name in robots.unsaved else ""
+    return f"{defined}{f' (distances in mm: {pairs})' if pairs else ''}{lost}; for robots.yaml:\n  {entry}"

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Fuses recorded detections: every frame set, by the code that runs live.
+
+The frame sets are those that the server formed, so that a replay repeats its poses exactly: which frames form a set
+depends on when they arrived at the server, and a recorder does not know that. Without a server they are formed from the
+times of arrival.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.rig.camera import Camera
+from calib.rig.recording import RecordingWriter, as_they_arrived, read_messages
+from calib.rig.rig import load_rig
+from camera_node.foundation.errors import ConfigError
+from camera_node.protocol.messages import Detections, Keys, encode
+from camera_node.sources.recorded_detections import detect_frames, read_observations
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.limits import Limits
+from fusion.model.robots import Robot, load_robots
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
+from fusion.protocol.pose_messages import FusedFrames
+from fusion.recordings.arena_recording import ArenaRecording
+from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.server.ingest import Refusal, admit
+from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult
+from fusion.tracking.smoothing import Smoother
+from fusion.tracking.tracker import Tracker
+
+STATES = ("tracked", "coasting", "lost")
+REFUSED: dict[Refusal, str] = {
+    "unknown camera": "which has no pose in the rig",
+    "wrong image size": "whose size is not the rig's",
+}
+
+
+@dataclass(frozen=True)
+class OfflineArena:
+    """The arena of a recording.
+
+    Attributes:
+        cameras: the placed ones.
+        robots: see `load_robots`.
+        rate_hz: poses a second; without it the rate of the fastest camera.
+        limits: see `Limits`.
+        smooth: estimate each pose from the whole recording, not only from the frames before it.
+
+    Raises:
+        ConfigError: the rate is implausible.
+    """
+
+    cameras: dict[str, Camera]
+    robots: dict[str, Robot]
+    rate_hz: float | None = None
+    limits: Limits = field(default_factory=Limits)
+    smooth: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rate_hz is not None and not 0.1 <= self.rate_hz <= 1000:
+            raise ConfigError(f"--rate-hz {self.rate_hz} is not within 0.1 and 1000")
+
+
+@dataclass
+class Summary:
+    """Counts over a run."""
+
+    frame_sets: int = 0
+    states: Counter[tuple[str, str]] = field(default_factory=Counter)
+    used: Counter[str] = field(default_factory=Counter)
+    unused: Counter[str] = field(default_factory=Counter)
+    squared_px: dict[str, float] = field(default_factory=dict)
+    unlabeled: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    moves: list[str] = field(default_factory=list)
+
+    def add(self, fused: TrackingResult) -> None:
+        """Count a fused frame set."""
+        self.frame_sets += 1
+        self.states.update((pose.robot, pose.state) for pose in fused.poses)
+        self.unlabeled += int((fused.markers.robot_index() < 0).sum())
+        self.faults.update(f"{TOO_MANY_UNASSIGNED}, of camera '{name}'" for name in fused.crowded)
+        for name, use in fused.cameras.items():
+            self.used[name] += use.used
+            self.unused[name] += use.unused
+            self.squared_px[name] = self.squared_px.get(name, 0.0) + use.squared_px
+
+    def add_correction(self, correction: ExtrinsicsCorrection, t_ns: int) -> None:
+        """Note that a camera was moved, or recalibrated after a move."""
+        if correction.camera is None:
+            event = f"seen at t_ns {t_ns}; its detections are excluded from then on"
+        else:
+            event = f"recalibrated at t_ns {t_ns} and used again; the rig file is unchanged"
+        self.moves.append(f"moved: camera '{correction.name}', {event}")
+
+    def lines(self, robots: Iterable[str]) -> Iterator[str]:
+        """The summary, one line a subject."""
+        yield f"{self.frame_sets} frame sets, {self.unlabeled} unlabeled markers"
+        for robot in robots:
+            shares = (f"{s} {self.states[robot, s] / max(self.frame_sets, 1):.1%}" for s in STATES)
+            yield f"{robot}: {', '.join(shares)}"
+        for name in sorted(self.used):
+            rms = np.sqrt(self.squared_px[name] / self.used[name]) if self.used[name] else np.nan
+            yield (
+                f"{name}: residual {rms:.2f} px, {self.used[name]} detections assigned, {self.unused[name]} not"
+            )
+        for reason, count in sorted(self.faults.items()):
+            yield f"skipped: {count} {reason}"
+        yield from self.moves
+
+
+def fuse_recording(
+    messages: Iterable[tuple[int, Detections]], arena: OfflineArena, summary: Summary | None = None
+) -> Iterator[TrackingResult]:
+    """Fuse recorded detections.
+
+    Args:
+        messages: when each message of a camera arrived (ns), and the message, in order of arrival.
+        arena: its cameras and robots.
+        summary: counts the results, the skipped messages and the moved cameras.
+    """
+    summary = Summary() if summary is None else summary
+    tracker = Tracker(arena.cameras, arena.robots, arena.limits)
+    yield from _fuse(_synchronize(messages, tracker, arena, summary.faults), tracker, arena, summary)
+
+
+def fuse_frame_sets(
+    frame_sets: Iterable[FrameSet], arena: OfflineArena, summary: Summary | None = None
+) -> Iterator[TrackingResult]:
+    """Fuse frame sets, as those that the server formed; see `fuse_recording`."""
+    tracker = Tracker(arena.cameras, arena.robots, arena.limits)
+    yield from _fuse(frame_sets, tracker, arena, Summary() if summary is None else summary)
+
+
+def _fuse(
+    frame_sets: Iterable[FrameSet], tracker: Tracker, arena: OfflineArena, summary: Summary
+) -> Iterator[TrackingResult]:
+    smoother = Smoother(tracker.table.names) if arena.smooth else None
+    for frame_set in frame_sets:
+        fused = tracker.track(frame_set)
+        summary.add(fused)
+        if smoother is None:
+            yield fused
+        else:
+            smoother.add(fused)
+        for correction in tracker.check_extrinsics(frame_set, fused):
+            summary.add_correction(correction, frame_set.t_ns)
+    if smoother is not None:
+        yield from smoother.smooth()
+
+
+def read_detections(
+    frames: Path | None, observations: Path | None, cameras: dict[str, Camera]
+) -> list[tuple[int, Detections]]:
+    """Detections of a folder of frames or of an `observations.csv`, as if each arrived at its true capture time.
+
+    Raises:
+        ConfigError: not exactly one of both is given, or it can't be read.
+    """
+    if frames is not None and observations is None:
+        messages = detect_frames(frames)
+    elif observations is not None and frames is None:
+        messages = read_observations(observations, {name: (c.width, c.height) for name, c in cameras.items()})
+    else:
+        raise ConfigError("give either --frames FOLDER or --observations CSV")
+    return as_they_arrived(messages, cameras)
+
+
+def _synchronize(
+    messages: Iterable[tuple[int, Detections]],
+    tracker: Tracker,
+    arena: OfflineArena,
+    faults: Counter[str],
+) -> Iterator[FrameSet]:
+    synchronizer = FrameSynchronizer.at_rate(arena.rate_hz, arena.limits.lateness_ms)
+    for received_ns, message in messages:
+        name, admitted = message.camera, admit(message, arena.cameras, received_ns)
+        if not isinstance(admitted, CalibratedFrame):
+            faults[f"frames of camera '{name}', {REFUSED[admitted]}"] += 1
+            continue
+        frame = tracker.admit(admitted)
+        if frame is not None:
+            synchronizer.add(frame)
+        else:
+            synchronizer.ignore(name)
+            faults[f"frames of camera '{name}', whose clock was wrong or whose image was frozen"] += 1
+        yield from synchronizer.take(received_ns)
+    for name, late in synchronizer.late.items():
+        if late:
+            faults[f"frames of camera '{name}' that arrived too late"] += late
+    yield from synchronizer.finish()
+
+
+def recorded_frame_sets(
+    recording: ArenaRecording, cameras: dict[str, Camera], faults: Counter[str]
+) -> Iterator[FrameSet]:
+    """Yield the server's frame sets from the first one of which all frames were recorded.
+
+    Args:
+        recording: of the server and its cameras.
+        cameras: the placed ones, with the poses that the server used.
+        faults: counts frames that the server used and the recording does not hold.
+    """
+    messages: dict[tuple[str, int], Detections] = {}
+    for _, message in recording.detections:
+        messages.setdefault((message.camera, message.t_ns), message)  # the server refuses duplicates, too
+    has_begun = False
+    for fused in recording.frame_sets:
+        frames = tuple(_frames(fused, messages, cameras))
+        n_missing = len(fused.cameras) - len(frames)
+        has_begun = has_begun or (len(frames) > 0 and not n_missing)
+        if has_begun:
+            if n_missing:
+                faults["frames that the server used and the recording does not hold"] += n_missing
+            yield FrameSet(fused.t_ns, frames)
+
+
+def _frames(
+    fused: FusedFrames, messages: dict[tuple[str, int], Detections], cameras: dict[str, Camera]
+) -> Iterator[CalibratedFrame]:
+    for name, stamp_ns, t_ns, clock_sigma_s in fused.rows():
+        message = messages.get((name, stamp_ns))
+        frame = None if message is None else admit(message, cameras)
+        if isinstance(frame, CalibratedFrame):
+            yield replace(frame, t_ns=t_ns, clock_sigma_s=clock_sigma_s)
+
+
+def cameras_of(recording: ArenaRecording, path: Path, rig: Path | None) -> dict[str, Camera]:
+    """The placed cameras of the file `rig`, or else of the recording.
+
+    Raises:
+        ConfigError, CalibrationError: there is no rig, or it places no camera.
+    """
+    if rig is not None:
+        return load_rig(rig).require_placed(rig)
+    if recording.rig is None:
+        raise ConfigError(f"{path} holds no rig; give --rig rig.yaml")
+    return recording.rig.placed()
+
+
+def robots_of(recording: ArenaRecording, path: Path, robots: Path | None) -> dict[str, Robot]:
+    """The robots of the file `robots`, or else of the recording.
+
+    Raises:
+        ConfigError, FusionError: there are none, or they can't be tracked.
+    """
+    if robots is None and not recording.robots:
+        raise ConfigError(f"{path} holds no robots; give --robots robots.yaml")
+    return load_robots(robots) if robots else recording.robots
+
+
+def write_recording(source: Path, out: Path, fused: Iterable[TrackingResult]) -> None:
+    """Copy a recording with other poses and markers, which are logged at the times of their frame sets."""
+    entries = [e for e in read_messages(source, Counter()) if not e[0].endswith(("/pose", "/markers"))]
+    arena = next(key for key, _, _ in entries if key.endswith("/detections")).split("/")[0]
+    keys = Keys(arena)
+    for frame_set in fused:
+        entries += [(keys.robot_pose(pose.robot), encode(pose), frame_set.t_ns) for pose in frame_set.poses]
+        entries.append((keys.markers, encode(frame_set.markers), frame_set.t_ns))
+    with RecordingWriter(out) as writer:
+        for entry in sorted(entries, key=lambda entry: entry[2]):
+            writer.put(*entry)

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Lists recordings with their length, cameras and robots, from the index at a file's end: no message is read."""
+
+import re
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from calib.rig.recording import RecordingWriter, read_messages
+from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import ConfigError
+
+KEY = re.compile(r".+?/(camera|robot)/([^/]+)/(?:detections|pose)")
+MAX_FILES = 200  # of one folder, the newest
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """What a recording holds.
+
+    Attributes:
+        path: the file.
+        size_bytes: of the file.
+        seconds: from the first message to the last; None if the file has no index, as while it is written.
+        cameras: their names.
+        robots: their names.
+    """
+
+    path: Path
+    size_bytes: int
+    seconds: float | None = None
+    cameras: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()
+
+
+def summarize_recording(path: Path) -> RecordingSummary:
+    """Read the index of a recording; raises OSError if the file can't be read."""
+    size = path.stat().st_size
+    try:
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+    except (McapError, ValueError, EOFError, OSError):  # OSError: its end is sought before its beginning
+        summary = None
+    if summary is None or summary.statistics is None:
+        return RecordingSummary(path, size)
+    statistics = summary.statistics
+    named = [found for channel in summary.channels.values() if (found := KEY.fullmatch(channel.topic))]
+    names = {kind: tuple(sorted({m[2] for m in named if m[1] == kind})) for kind in ("camera", "robot")}
+    seconds = (statistics.message_end_time - statistics.message_start_time) / 1e9
+    return RecordingSummary(path, size, seconds, names["camera"], names["robot"])
+
+
+def list_recordings(folder: Path) -> list[RecordingSummary]:
+    """The recordings (*.mcap) of a folder, the newest first."""
+    times_ns: dict[Path, int] = {}
+    for path in folder.glob("*.mcap"):
+        with suppress(OSError):  # it was removed or renamed just now
+            times_ns[path] = path.stat().st_mtime_ns
+    found = []
+    for path in sorted(times_ns, key=lambda path: times_ns[path], reverse=True)[:MAX_FILES]:
+        with suppress(OSError):
+            found.append(summarize_recording(path))
+    return found
+
+
+SUFFIX = ".mcap"
+
+
+def recording_path(folder: Path, name: str) -> Path:
+    """The file of a recording with a name, with or without its suffix. Raises ConfigError for what is no name."""
+    return folder / f"{require_name(name.removesuffix(SUFFIX), 'a recording')}{SUFFIX}"
+
+
+def rename_recording(recording: Path, name: str) -> Path:
+    """Give a recording another name in its folder; return its new path.
+
+    Raises:
+        ConfigError: it is no recording, the name is invalid or taken, or the folder can't be written.
+    """
+    _require_recording(recording)
+    new = recording_path(recording.parent, name)
+    if new.exists():
+        raise ConfigError(f"{new} exists; give another name")
+    try:
+        return recording.rename(new)
+    except OSError as error:
+        raise ConfigError(f"{recording} can't be renamed: {error.strerror}") from None
+
+
+def remove_recording(recording: Path) -> None:
+    """Delete a recording for good. Raises ConfigError if it is no recording, or its folder can't be written."""
+    _require_recording(recording)
+    try:
+        recording.unlink()
+    except OSError as error:
+        raise ConfigError(f"{recording} can't be removed: {error.strerror}") from None
+
+
+def _require_recording(path: Path) -> None:
+    if path.suffix != SUFFIX:
+        raise ConfigError(f"{path} is no recording; name a file that ends with {SUFFIX}")
+    if not path.is_file():
+        raise ConfigError(
+            f"{path} does not exist; roundel recordings list {path.parent} lists the recordings"
+        )
+
+
+CONTEXT = (
+    "/rig",
+    "/robots",
+    "/status",
+)  # ends of keys whose latest message before the part still holds in it
+
+
+def trim_recording(recording: Path, out: Path, from_s: float, to_s: float) -> int:
+    """Write the messages that arrived from `from_s` to `to_s` after the first one, and what held at `from_s`: the
+    rig, the robots and the states of the cameras and the server.
+
+    Returns:
+        the number of messages in the part.
+
+    Raises:
+        ConfigError: no message is in the part, the recording can't be read, or `out` exists or can't be written.
+    """
+    if not 0 <= from_s < to_s:
+        raise ConfigError(f"a part from {from_s:g} s to {to_s:g} s is empty; give --from-s below --to-s")
+    faults: Counter[str] = Counter()
+    start_ns = min((t_ns for *_, t_ns in read_messages(recording, faults)), default=0)
+    begin_ns, end_ns = (start_ns + round(s * 1e9) for s in (from_s, min(to_s, 1e9)))
+    context: dict[str, bytes] = {}
+    n_written = 0
+    with RecordingWriter(out, overwrite=False) as writer:
+        for key, data, t_ns in read_messages(recording, faults):
+            if t_ns < begin_ns and key.endswith(CONTEXT):
+                context[key] = data
+            if not begin_ns <= t_ns <= end_ns:
+                continue
+            if not n_written:
+                for earlier, held in context.items():
+                    writer.put(earlier, held, begin_ns)
+            writer.put(key, data, t_ns)
+            n_written += 1
+    if not n_written:
+        out.unlink()
+        raise ConfigError(f"{recording} has no message from {from_s:g} s to {to_s:g} s after its start")
+    return n_written
