@@ -3,6 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(shell find camera_node/native fusion/native -name '*.[ch]pp')
+CORES := $(shell find camera_node/native fusion/native -name '*.cpp' ! -name 'bind*')
 
 .PHONY: demo test check docs setup format clean
 
@@ -16,6 +17,9 @@ check: .venv/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/clang-format --dry-run --Werror $(NATIVE)
+	@command -v clang++ >/dev/null || echo "clang++ is not installed: its warnings are not checked"
+	@! command -v clang++ >/dev/null || printf '%s\n' $(CORES) | xargs -P 4 -I FILE clang++ -fsyntax-only -std=c++20 \
+	  -Werror -Wall -Wextra -Wpedantic -Wshadow -Wcomma -Icamera_node/native -Ifusion/native FILE
 	$(BIN)/lint-imports
 	$(BIN)/basedpyright
 

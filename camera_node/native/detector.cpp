@@ -86,7 +86,10 @@ void Detector::fit_tracked(FrameState& frame) const {
 bool Detector::explore() {
     const bool any = print_ratios_ && explore_in_-- <= 0;
     chords_.set_limits(any ? any_limits_ : limits_, any);
-    if (any) explore_in_ = kExploreInterval - 1, n_frames_ = kSearchInterval;
+    if (any) {
+        explore_in_ = kExploreInterval - 1;
+        n_frames_ = kSearchInterval;
+    }
     return any;
 }
 
@@ -99,7 +102,10 @@ void Detector::search_by_chords(FrameState& frame) {
 /// The parts that changed, except for those under roundels that were found already; a band of the frame if
 /// they are too large.
 std::vector<Box> Detector::parts_to_search(const FrameState& frame) {
-    if (n_frames_ == kSearchInterval || n_postponed_) change_mask_.invalidate(), n_frames_ = 0;
+    if (n_frames_ == kSearchInterval || n_postponed_) {
+        change_mask_.invalidate();
+        n_frames_ = 0;
+    }
     ++n_frames_;
     change_mask_.update(frame.image);
     for (const TrackedFit& roundel : frame.found) change_mask_.mask(roundel.fit.outer);
@@ -134,9 +140,16 @@ void Detector::search_part(const Box& part, FrameState& frame) {
     const ImageView view = window(frame.image, part);
     chords_.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
     const float left = float(part.left), top = float(part.top);
-    for (Seed seed : chords_.seeds()) seed.x += left, seed.y += top, frame.seeds.push_back(seed);
-    for (Streak streak : chords_.streaks())
-        streak.x += left, streak.y += top, frame.streaks.push_back(streak);
+    for (Seed seed : chords_.seeds()) {
+        seed.x += left;
+        seed.y += top;
+        frame.seeds.push_back(seed);
+    }
+    for (Streak streak : chords_.streaks()) {
+        streak.x += left;
+        streak.y += top;
+        frame.streaks.push_back(streak);
+    }
 }
 
 /// Fits the seeds. If there are more than the fits allowed, the next frame begins with those that are left.
@@ -196,7 +209,8 @@ void Detector::fit_moving_streaks(FrameState& frame) const {
         const int may_fail = misfit < kPoorMisfit || fits > failures ? kMaxFailures : 1;
         if (failures >= may_fail || fits == kMaxMovingFits) break;
         if (frame.suppression.contains(guess.still.outer.x, guess.still.outer.y)) continue;
-        ++fits, failures += !accept(fit_new_moving(frame.image, guess, context(frame)), -1, frame);
+        ++fits;
+        failures += !accept(fit_new_moving(frame.image, guess, context(frame)), -1, frame);
     }
 }
 
@@ -215,7 +229,8 @@ void Detector::learn_prints(const FrameState& frame) {
 }
 
 void Detector::use_prints() {
-    limits_.prints = print_ratios_->prints(), limits_.any_print = !print_ratios_->decided();
+    limits_.prints = print_ratios_->prints();
+    limits_.any_print = !print_ratios_->decided();
     any_limits_.prints = limits_.prints;
     matcher_.use_prints(limits_.prints);
 }
@@ -234,7 +249,8 @@ void Detector::learn_camera(const FrameState& frame) {
 void Detector::learn_response(const std::vector<const RoundelFit*>& clear) {
     const double exponent = response_.exponent_in_use();
     if (!response_.learn(clear, limits_)) return;
-    change_mask_.invalidate(), tracks_.forget_models();
+    change_mask_.invalidate();
+    tracks_.forget_models();
     light_.scale(response_.exponent_in_use() / exponent);
     if (print_ratios_) print_ratios_->forget_measurements();
 }
@@ -243,7 +259,10 @@ void Detector::learn_response(const std::vector<const RoundelFit*>& clear) {
 void Detector::update_theta(const FrameState& frame) {
     if (frame.found.empty()) return paper_->step();
     double dark = 0, bright = 0;
-    for (const TrackedFit& roundel : frame.found) dark += roundel.fit.dark, bright += roundel.fit.bright;
+    for (const TrackedFit& roundel : frame.found) {
+        dark += roundel.fit.dark;
+        bright += roundel.fit.bright;
+    }
     paper_->set_levels(dark / double(frame.found.size()), bright / double(frame.found.size()));
 }
 
@@ -307,8 +326,14 @@ std::optional<double> Detector::tone_exponent() const {
 void Detector::take_over(Detector& from) {
     if (&from == this) return;
     const std::scoped_lock lock(mutex_, from.mutex_);
-    tracks_ = from.tracks_, response_ = from.response_, bend_ = from.bend_, light_ = from.light_;
-    if (print_ratios_ && from.print_ratios_) print_ratios_ = from.print_ratios_, use_prints();
+    tracks_ = from.tracks_;
+    response_ = from.response_;
+    bend_ = from.bend_;
+    light_ = from.light_;
+    if (print_ratios_ && from.print_ratios_) {
+        print_ratios_ = from.print_ratios_;
+        use_prints();
+    }
     if (paper_ && from.paper_) paper_ = from.paper_;
 }
 

@@ -14,18 +14,23 @@ namespace roundel {
 namespace {
 
 // Limits within which a shape is ring-like.
-constexpr Print kThinnest{0.8}, kThickest{0.2};
-constexpr double kMinDiameter = 6, kMaxDiameter = 10000, kMinContrast = 8;
-constexpr double kNoiseSpan = 6;    // standard deviations: contrast of a ring that noise does not make
-constexpr double kRingDepth = 0.3;  // of a bullseye's further rings
-constexpr double kSameCentre = 0.3, kSameSize = 1.5;  // minor axes; factor: two ellipses of one ring
+constexpr Print kThinnest{0.8};
+constexpr Print kThickest{0.2};
+constexpr double kMinDiameter = 6;
+constexpr double kMaxDiameter = 10000;
+constexpr double kMinContrast = 8;
+constexpr double kNoiseSpan = 6;     // standard deviations: contrast of a ring that noise does not make
+constexpr double kRingDepth = 0.3;   // of a bullseye's further rings
+constexpr double kSameCentre = 0.3;  // minor axes, for two ellipses of one ring
+constexpr double kSameSize = 1.5;    // factor, for two ellipses of one ring
 constexpr size_t kMaxCandidates = 4096, kMaxRefused = 512;
 
 RoundelLimits ring_limits(double noise) {
     RoundelLimits limits;
     limits.prints = {kThickest, {0.4}, {0.6}, kThinnest};
     limits.ratio_tolerance = 0.1;
-    limits.min_diameter = kMinDiameter, limits.max_diameter = kMaxDiameter;
+    limits.min_diameter = kMinDiameter;
+    limits.max_diameter = kMaxDiameter;
     limits.min_contrast = std::max(kMinContrast, kNoiseSpan * noise);
     return limits;
 }
@@ -35,7 +40,8 @@ std::optional<RefusedRing> refuse(const ImageView& image, const InitialGuess& gu
                                   const AcceptanceContext& context) {
     const RefusedRing seen{guess.outer, guess.ratio, guess.bright - guess.dark, 0, Refusal::kNoFit};
     InitialGuess start = guess;
-    start.light = context.light.at(guess.outer.x, guess.outer.y), start.tone = context.tone;
+    start.light = context.light.at(guess.outer.x, guess.outer.y);
+    start.tone = context.tone;
     if (const auto accepted = fit_roundel(image, start, context, false)) {
         const bool bullseye = is_bullseye(image, *accepted, kRingDepth);
         if (!bullseye && has_black_ink(*accepted)) return std::nullopt;

@@ -19,7 +19,8 @@ struct FrameColumns {
         for (const auto& [fit, number] : roundels) {
             uv.insert(uv.end(), {fit.outer.x, fit.outer.y});
             axes_px.insert(axes_px.end(), {fit.outer.major, fit.outer.minor});
-            angle_rad.push_back(fit.outer.angle), ratio.push_back(fit.ratio);
+            angle_rad.push_back(fit.outer.angle);
+            ratio.push_back(fit.ratio);
             contrast.push_back(fit.contrast());
             offset_px.insert(offset_px.end(), {fit.offset_x, fit.offset_y});
             for (int i = 0; i < kPoseCount; ++i)  // rounding makes the halves differ: the upper one counts

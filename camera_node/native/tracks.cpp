@@ -35,8 +35,10 @@ std::vector<Ellipse> Tracks::lost() const {
 
 InitialGuess ExpectedRoundel::guess() const {
     InitialGuess guess{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p, fit.noise, fit.ground};
-    guess.outer.x += vx, guess.outer.y += vy;
-    (*guess.model)[kX] += vx, (*guess.model)[kY] += vy;
+    guess.outer.x += vx;
+    guess.outer.y += vy;
+    (*guess.model)[kX] += vx;
+    (*guess.model)[kY] += vy;
     // The parameters beside fields are no solution without them: a single step from there leaves residuals
     // that would show the fields again.
     if (fit.fields.any()) guess.model.reset();
@@ -56,7 +58,10 @@ const Tracks::Track* Tracks::nearest(const RoundelFit& fit, const std::vector<bo
         const Track& t = tracks_[k];
         if (taken[k]) continue;
         const double apart = distance(t, fit);
-        if (apart < least) least = apart, best = &t;
+        if (apart < least) {
+            least = apart;
+            best = &t;
+        }
     }
     return best;
 }
@@ -84,7 +89,8 @@ void Tracks::update(std::vector<TrackedFit>& found) {
         if (const Track* t = nearest(roundel.fit, taken)) {
             continue_track(roundel, *t);
         } else {
-            roundel.track = next_, next_ = (next_ + 1) % kNumbers;
+            roundel.track = next_;
+            next_ = (next_ + 1) % kNumbers;
             now.push_back({roundel.track, roundel.fit, 0, 0, 0, false});
         }
     }

@@ -18,7 +18,8 @@ struct ExpectedRoundel {
     Seed seed;  // at the predicted position
     int track;
     RoundelFit fit;  // of the last frame
-    double vx, vy;   // pixels per frame
+    double vx;       // pixels per frame
+    double vy;       // pixels per frame
     bool steady;     // was at its predicted position and unoccluded
     /// The last frame's model, moved to the predicted position.
     InitialGuess guess() const;
@@ -41,8 +42,9 @@ class Tracks {
     struct Track {
         int number;
         RoundelFit fit;
-        double vx, vy;  // pixels per frame
-        int missed;     // frames
+        double vx;   // pixels per frame
+        double vy;   // pixels per frame
+        int missed;  // frames
         bool steady;
     };
     static double distance(const Track& track, const RoundelFit& fit);

@@ -64,7 +64,8 @@ struct ExpectedView {
     double radius;
     Covariance2 covariance;
     double log_size_variance;
-    double vx, vy;  // of the image, 1/s: a row captured later shows the marker farther along
+    double vx;  // of the image, 1/s: a row captured later shows the marker farther along
+    double vy;  // of the image, 1/s
 };
 
 /// The detections of one frame, sorted by x for range queries.

@@ -15,7 +15,8 @@ double length(const Vector& v) { return std::sqrt(dot(v, v)); }
 
 ViewAngles ViewAngles::of(const CloudPoint& point, const Vector& direction) {
     if (point.to_cameras.empty()) return {};
-    double smallest = 1, largest = -1;  // cosines
+    double smallest = 1;  // cosine
+    double largest = -1;  // cosine
     for (const Vector& to : point.to_cameras) {
         const double cosine = dot(direction, to) / std::fmax(length(direction) * length(to), 1e-12);
         smallest = std::fmin(smallest, cosine);
@@ -160,7 +161,10 @@ class Search {
         for (const size_t k : rows) {
             size_t count = 0;
             for (const size_t other : rows) count += agree_[k * later_.size() + other];
-            if (count > most) best = k, most = count;
+            if (count > most) {
+                best = k;
+                most = count;
+            }
         }
         return best;
     }
@@ -195,8 +199,9 @@ class Search {
     std::vector<int64_t> mapped_;
     std::vector<std::vector<int64_t>> found_;  // by the number of mapped markers
     Pair lowest_{};                            // the mapped pair with the lowest marker
-    std::vector<Pair> later_, others_;  // pairs that agree with it: with higher markers; with one marker
-    std::vector<char> agree_;           // of later pairs with each other
+    std::vector<Pair> later_;                  // pairs that agree with it, with higher markers
+    std::vector<Pair> others_;                 // pairs that agree with it, with one marker
+    std::vector<char> agree_;                  // of later pairs with each other
     size_t steps_ = 0;
 };
 

@@ -42,7 +42,10 @@ void view_discs(const FramePoses& poses, const Discs& discs, double* to) {
         const DiscView seen = view_disc(poses.at(discs, k), discs.at(k));
         double* row = to + k;
         for (const Vector& v : {seen.centre, seen.normal, seen.q})
-            for (const double value : {v.x, v.y, v.z}) *row = value, row += n;
+            for (const double value : {v.x, v.y, v.z}) {
+                *row = value;
+                row += n;
+            }
         row[0] = seen.x;
         row[n] = seen.y;
     }

@@ -34,7 +34,8 @@ struct Body {
 struct BodyInCamera {
     Matrix R_cam, R_world;
     Vector t_cam;
-    Vector omega_cam, v_cam;  // angular velocity and velocity, camera frame
+    Vector omega_cam;  // angular velocity, camera frame
+    Vector v_cam;      // velocity, camera frame
 };
 BodyInCamera transform(const Body& body, const Exposure& exposure);
 
@@ -65,7 +66,10 @@ class FramePoses {
     const std::vector<Exposure>& exposures() const { return exposures_; }
     const BodyInCamera& at(size_t frame, size_t body) const {
         const size_t k = frame * n_bodies_ + body;
-        if (!is_known_[k]) poses_[k] = transform(bodies_[body], exposures_[frame]), is_known_[k] = true;
+        if (!is_known_[k]) {
+            poses_[k] = transform(bodies_[body], exposures_[frame]);
+            is_known_[k] = true;
+        }
         return poses_[k];
     }
     /// The pose of the body of disc `k` when its image was captured.

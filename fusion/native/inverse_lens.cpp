@@ -52,7 +52,8 @@ struct LensAt {
         const double first = (3 * first_aa + first_bb + 2 * second_ab) / 8;
         const double second = (second_aa + 3 * second_bb + 2 * first_ab) / 8;
         if (!(first * first + second * second < kMaxShift * kMaxShift)) return;  // or an unknown ellipse
-        cx += m11 * first + m12 * second, cy += m21 * first + m22 * second;
+        cx += m11 * first + m12 * second;
+        cy += m21 * first + m22 * second;
     }
 };
 
@@ -75,14 +76,17 @@ void look_up(const InverseLens& lens, const Outlines& seen, double* xy, double* 
         const double s = 2 * (u - column) - 1, t = 2 * (v - row) - 1;
         const double* cell = lens.cell(column, row);
         const Polynomial x = evaluate(cell, s, t), y = evaluate(cell + 10, s, t);
-        xy[k] = x.value, xy[n + k] = y.value;
+        xy[k] = x.value;
+        xy[n + k] = y.value;
         const double c = per_px * std::cos(seen.angle[k]), d = per_px * std::sin(seen.angle[k]);
         const double a = seen.axes[2 * k] / 2, b = seen.axes[2 * k + 1] / 2;
         const LensAt at{x, y, Curvature::of(cell, s, t), Curvature::of(cell + 10, s, t)};
         at.move_centre({c * a, d * a}, {-d * b, c * b}, xy[k], xy[n + k]);
         const double per_det = 1 / (per_px * (x.by_s * y.by_t - x.by_t * y.by_s));
-        scale[k] = per_det * y.by_t, scale[n + k] = -per_det * x.by_t;
-        scale[2 * n + k] = -per_det * y.by_s, scale[3 * n + k] = per_det * x.by_s;
+        scale[k] = per_det * y.by_t;
+        scale[n + k] = -per_det * x.by_t;
+        scale[2 * n + k] = -per_det * y.by_s;
+        scale[3 * n + k] = per_det * x.by_s;
     }
 }
 

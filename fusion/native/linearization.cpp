@@ -24,7 +24,11 @@ DiscDerivatives differentiate(const DiscView& view, double radius, double wx, do
     return by;
 }
 
-void write(double* to, const Vector& v) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
+void write(double* to, const Vector& v) {
+    to[0] = v.x;
+    to[1] = v.y;
+    to[2] = v.z;
+}
 
 /// Writes the row of one equation. The derivatives by the velocities are tau times those by the pose.
 void write_row(const DiscDerivatives& by, const BodyInCamera& body, const Exposure& exposure,
@@ -58,7 +62,8 @@ void write_shears(const Shear (&at)[3], const PlaneAxes& about, double sigma, Eq
     };
     write(along, slopes(at[0].along - at[1].along, at[0].along - at[2].along));
     write(across, slopes(at[0].across - at[1].across, at[0].across - at[2].across));
-    along[kErrors] = weight * at[0].along, across[kErrors] = weight * at[0].across;
+    along[kErrors] = weight * at[0].along;
+    across[kErrors] = weight * at[0].across;
 }
 
 }  // namespace

@@ -78,7 +78,8 @@ void reweigh_body(BodySums& sums) {
         const double change = reconsider(sums, solve(sums.H, sums.g), weights);
         if (round > 0 && change < kConverged) break;  // the next linearization continues, if there is one
         std::swap(sums.weights, weights);
-        sums.H = H, sums.g = g;
+        sums.H = H;
+        sums.g = g;
         add(sums);
     }
     for (int i = 0; i < kErrors; ++i)
@@ -105,12 +106,17 @@ void reweigh(const EquationSystem& system, ErrorMatrix* H, ErrorVector* g, doubl
     const ByBody of(system);
     for (size_t b = 0; b < system.n_bodies; ++b) {
         const std::span indices(of.indices.data() + of.first[b], of.first[b + 1] - of.first[b]);
-        sums.equations.clear(), sums.weights.clear();
-        for (const size_t k : indices)
-            sums.equations.push_back(system.equations[k]), sums.weights.push_back(weights[k]);
-        sums.H = *H, sums.g = *g;
+        sums.equations.clear();
+        sums.weights.clear();
+        for (const size_t k : indices) {
+            sums.equations.push_back(system.equations[k]);
+            sums.weights.push_back(weights[k]);
+        }
+        sums.H = *H;
+        sums.g = *g;
         reweigh_body(sums);
-        *H++ = sums.H, *g++ = sums.g;
+        *H++ = sums.H;
+        *g++ = sums.g;
         for (size_t k = 0; k < indices.size(); ++k) weights[indices[k]] = sums.weights[k];
     }
 }

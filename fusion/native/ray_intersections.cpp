@@ -9,7 +9,8 @@ namespace roundel::fusion {
 namespace {
 
 struct Intersection {
-    double range, reach;  // along one ray, and its tolerance
+    double range;  // along one ray
+    double reach;  // tolerance of the range
 };
 using Intersections = std::vector<std::vector<Intersection>>;  // by ray
 
@@ -17,8 +18,9 @@ using Intersections = std::vector<std::vector<Intersection>>;  // by ray
 struct FrameRays {
     std::vector<size_t> ray;
     std::vector<double> x, y, z;
-    double reach = 0;                 // largest tolerance, at the largest range
-    double earliest = 0, latest = 0;  // of `Rays::moved`
+    double reach = 0;     // largest tolerance, at the largest range
+    double earliest = 0;  // of `Rays::moved`
+    double latest = 0;    // of `Rays::moved`
 
     /// The largest motion between a ray and one of these.
     double most_moved(double moved) const { return std::max(moved - earliest, latest - moved); }
@@ -33,7 +35,9 @@ std::vector<FrameRays> rays_by_frame(const Rays& rays, size_t n_frames) {
         of_frame.earliest = is_first ? rays.moved[k] : std::min(of_frame.earliest, rays.moved[k]);
         of_frame.latest = is_first ? rays.moved[k] : std::max(of_frame.latest, rays.moved[k]);
         of_frame.ray.push_back(k);
-        of_frame.x.push_back(d.x), of_frame.y.push_back(d.y), of_frame.z.push_back(d.z);
+        of_frame.x.push_back(d.x);
+        of_frame.y.push_back(d.y);
+        of_frame.z.push_back(d.z);
         of_frame.reach = std::max(of_frame.reach, rays.reach[k] * rays.max_range(k));
     }
     return by_frame;
@@ -76,7 +80,10 @@ class FramePair {
             const Vector& d = rays_.direction[i];
             measure_misses(of_b, (1 / reach) * cross(baseline_, d), d, misses.data());
             size_t found = 0;
-            for (size_t k = 0; k < n; ++k) near[found] = of_b.ray[k], found += misses[k] < 1;
+            for (size_t k = 0; k < n; ++k) {
+                near[found] = of_b.ray[k];
+                found += misses[k] < 1;
+            }
             for (size_t k = 0; k < found; ++k) pass(i, near[k]);
         }
     }
@@ -124,7 +131,11 @@ double densest(std::vector<Intersection>& on_ray) {
     for (const auto& [range, reach] : on_ray) {
         const auto from = at(range - reach), to = at(range + reach);
         const double weight = double(to - from) - reach / (1 + reach);
-        if (weight > highest) highest = weight, first = from, last = to;
+        if (weight > highest) {
+            highest = weight;
+            first = from;
+            last = to;
+        }
     }
     double sum = 0;
     for (auto m = first; m != last; ++m) sum += m->range;
@@ -149,7 +160,8 @@ std::vector<double> densest_ranges(const Rays& rays, const std::vector<Viewpoint
     Intersections found(rays.n);
     intersect_all(rays, frames, 1, [&](const Passing& at) {
         const double along = at.reach / std::sqrt(at.parallax);
-        found[at.i].push_back({at.s, along}), found[at.j].push_back({at.t, along});
+        found[at.i].push_back({at.s, along});
+        found[at.j].push_back({at.t, along});
     });
     std::vector<double> ranges;
     for (auto& on_ray : found) ranges.push_back(densest(on_ray));

@@ -11,9 +11,10 @@ namespace {
 constexpr double kMisfit = 0.03;     // of the contrast: RMS residual on the ring's edges
 constexpr double kMinSupport = 0.7;  // share of the pixels on the path that are in the image
 constexpr double kMaxMotion = 1.2;   // major axes
-// Standard deviation of the centre, minor axes, of a roundel of the last frame and of a new one. Models of
-// clutter are blurred or long until few pixels determine them: 0.010 to 0.030, and roundels 0.003 at most.
-constexpr double kMaxSigma = 0.05, kMaxNewSigma = 0.008;
+// Standard deviation of the centre, minor axes. Models of clutter are blurred or long until few pixels
+// determine them: 0.010 to 0.030, and roundels 0.003 at most.
+constexpr double kMaxSigma = 0.05;      // of a roundel of the last frame
+constexpr double kMaxNewSigma = 0.008;  // of a new one
 constexpr double kMaxChange = 1.3;      // factor by which contrast and axes differ from the last frame's
 constexpr double kMinMinor = 12;        // pixels: smaller ones cannot be distinguished from clutter
 constexpr double kReach = 0.75;         // minor axes searched around the predicted position, plus
@@ -55,7 +56,8 @@ std::optional<RoundelFit> fit_known_moving(const ImageView& image, const KnownRo
                                                                                              : std::nullopt;
     };
     MovingGuess predicted{{last.outer, last.ratio, last.dark, last.bright}, last.motion_x, last.motion_y};
-    predicted.still.outer.x += known.vx, predicted.still.outer.y += known.vy;
+    predicted.still.outer.x += known.vx;
+    predicted.still.outer.y += known.vy;
     if (std::hypot(last.motion_x, last.motion_y) > 0)
         if (const auto fit = fit_from(predicted)) return fit;
     const double minor = last.outer.minor;

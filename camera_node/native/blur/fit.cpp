@@ -28,22 +28,26 @@ constexpr Stage kCoarse{240, 1.5, 8, 7, 0.1, false}, kFine{1200, 1, 1000, 5, 0.0
 
 constexpr double kInitialBlur = 0.9;
 // Prior standard deviations. They are smaller than those of fit_photometric: a motion hides both.
-constexpr double kRatioPrior = 0.05, kBlurPrior = 0.5;
+constexpr double kRatioPrior = 0.05;
+constexpr double kBlurPrior = 0.5;
 constexpr double kMinMotion = 0.1;  // over the minor axis: below it the roundel counts as still
 constexpr double kMaxMotion = 4;    // mean radii
-// Residuals after the coarse stage: of the contrast, and grey levels of the noise.
-constexpr double kMaxMisfit = 0.08, kMaxNoise = 4;
+// Residuals after the coarse stage:
+constexpr double kMaxMisfit = 0.08;      // of the contrast
+constexpr double kMaxNoise = 4;          // grey levels
 constexpr double kMaxFineMisfit = 0.06;  // before the fine stage: it changes true fits by 0.005
 // Residuals over that limit after so many steps, beyond which no true roundel (1.8 and 1.3) reaches it.
 constexpr std::pair<int, double> kHopeful[] = {{2, 2.25}, {3, 1.5}};
-constexpr double kMinSpread = 0.2, kMaxSpread = 100;  // standard deviation of the ground, grey levels
+constexpr double kMinSpread = 0.2;  // standard deviation of the ground, grey levels
+constexpr double kMaxSpread = 100;  // standard deviation of the ground, grey levels
 constexpr SanityLimits kLimits{
     .shift = 0.6, .min_size = 0.6, .max_size = 1.6, .blur = 0, .underflow = 100, .overflow = 100};
 
 /// A motion followed by the parameters of a still picture.
 MovingParameters join(double x, double y, const Parameters& picture) {
     MovingParameters p{};
-    p[kMotionX] = x, p[kMotionY] = y;
+    p[kMotionX] = x;
+    p[kMotionY] = y;
     std::copy(picture.begin(), picture.end(), p.begin() + kStill);
     return p;
 }
@@ -118,7 +122,8 @@ class MovingFitter : GaussNewton<kMovingCount> {
 RoundelFit MovingFitter::fit() const {
     const auto pose = scaled(factor_->inverse_tail<kPoseCount>(), square(noise_));
     RoundelFit fit = make_fit(still(p_), pose, pixels_.origin_x, pixels_.origin_y);
-    fit.motion_x = p_[kMotionX], fit.motion_y = p_[kMotionY];
+    fit.motion_x = p_[kMotionX];
+    fit.motion_y = p_[kMotionY];
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
     fit.noise = noise_;
     fit.support = double(pixels_.used) / pixels_.expected;

@@ -26,10 +26,11 @@ constexpr double kMaxFirstMisfit = 0.4;   // RMS over the contrast in the direct
 constexpr double kMaxStartMisfit = 0.25;  // in the best direction, before the descent,
 // and after each of its rounds. Templates are not blurred and have five lengths: true matches reach 0.11.
 constexpr double kMaxMisfits[] = {0.2, 0.15, 0.13, 0.11};
-constexpr double kFirstStep = 0.1, kNextStep = 0.6;  // widths; factor from round to round
-constexpr double kRadians = 1.5;                     // of a step of one width
-constexpr double kTurns[] = {0, -0.25, 0.25};        // radians from the streak's direction
-constexpr float kMaxAsymmetry = 1.2f;                // of the contrast, between symmetric points
+constexpr double kFirstStep = 0.1;             // widths
+constexpr double kNextStep = 0.6;              // factor from round to round
+constexpr double kRadians = 1.5;               // of a step of one width
+constexpr double kTurns[] = {0, -0.25, 0.25};  // radians from the streak's direction
+constexpr float kMaxAsymmetry = 1.2f;          // of the contrast, between symmetric points
 
 /// The nearest pixels of a template's points; false if one is outside of the image.
 bool sample_known(const ImageView& image, const KnownTemplates& templates, double x, double y,
@@ -54,7 +55,10 @@ KnownMatch best_template(const KnownTemplate::Levels& levels, const KnownTemplat
                          double y) {
     KnownMatch best{x, y, nullptr, 1e9f};
     for (const KnownTemplate& t : templates.all())
-        if (const float m = t.misfit(levels); m < best.misfit) best.motion = &t, best.misfit = m;
+        if (const float m = t.misfit(levels); m < best.misfit) {
+            best.motion = &t;
+            best.misfit = m;
+        }
     return best;
 }
 
@@ -131,7 +135,8 @@ std::vector<MovingMatch> MotionBlurMatcher::match_known(const ImageView& image, 
     std::vector<MovingMatch> matches;
     for (const KnownMatch& m : pick(std::move(found), kMinDistance * predicted.outer.minor)) {
         MovingGuess guess{predicted, m.motion->motion_x, m.motion->motion_y};
-        guess.still.outer.x = m.x, guess.still.outer.y = m.y;
+        guess.still.outer.x = m.x;
+        guess.still.outer.y = m.y;
         matches.push_back({guess, std::sqrt(std::max(0.0, double(m.misfit))) / contrast});
     }
     return matches;

@@ -46,7 +46,10 @@ class MovingModel {
         clear(count, to);
         for (int n = 0; n < steps_; ++n) {
             const float t = reach_ * ((float(n) + 0.5f) * per_steps_ - 0.5f);
-            for (int k = 0; k < count * kLanes; ++k) u[k] = x[k] - t * motion_x_, v[k] = y[k] - t * motion_y_;
+            for (int k = 0; k < count * kLanes; ++k) {
+                u[k] = x[k] - t * motion_x_;
+                v[k] = y[k] - t * motion_y_;
+            }
             model_.evaluate(u, v, kMidLevels.data(), count, now);
             add(now, t, count, to);
         }

@@ -31,8 +31,11 @@ ROUNDEL_INLINE void weigh(const MovingGradient& model, const Lanes& level, float
     for (int i = 0; i < kMovingCount; ++i) columns[i][k] = root * model.by[i][k];
     columns[kMovingCount][k] = root * r;
     sums.w += w;
-    sums.ring += slope, sums.ring_rr += slope * r * r;
-    sums.ground += seen, sums.ground_rr += seen * r * r, sums.ground_ground += seen * gg;
+    sums.ring += slope;
+    sums.ring_rr += slope * r * r;
+    sums.ground += seen;
+    sums.ground_rr += seen * r * r;
+    sums.ground_ground += seen * gg;
 }
 
 ROUNDEL_CLONES void add_up(const MovingPixels& pixels, const MovingModel& model, float spread,
@@ -66,7 +69,8 @@ class DiscPath {
 
   private:
     void to_radii(double x, double y, double& u, double& v) const {
-        u = (p_[kAyy] * x - p_[kAxy] * y) / det_, v = (p_[kAxx] * y - p_[kAxy] * x) / det_;
+        u = (p_[kAyy] * x - p_[kAxy] * y) / det_;
+        v = (p_[kAxx] * y - p_[kAxy] * x) / det_;
     }
     Parameters p_;
     double det_, u_, v_, length_;
@@ -76,7 +80,8 @@ void append(const ImageView& image, int x, int y, MovingPixels& to) {
     const int u = x + to.origin_x, v = y + to.origin_y;
     ++to.expected;
     if (u < 0 || v < 0 || u >= image.width || v >= image.height || to.used == MovingPixels::kMax) return;
-    to.x[to.used] = float(x), to.y[to.used] = float(y);
+    to.x[to.used] = float(x);
+    to.y[to.used] = float(y);
     to.level[to.used++] = float(image.row(v)[u]);
 }
 
@@ -107,9 +112,13 @@ MovingSums accumulate(const MovingPixels& pixels, const MovingParameters& p, dou
         for (int j = 0; j <= i; ++j) H[i][j] = sum(sums.gram[j][i]);
         g[i] = sum(sums.gram[i][kMovingCount]);
     }
-    e.wrr = sum(sums.gram[kMovingCount][kMovingCount]), e.w = sum(sums.w);
-    e.ring = sum(sums.ring), e.ring_rr = sum(sums.ring_rr);
-    e.ground = sum(sums.ground), e.ground_rr = sum(sums.ground_rr), e.ground_ground = sum(sums.ground_ground);
+    e.wrr = sum(sums.gram[kMovingCount][kMovingCount]);
+    e.w = sum(sums.w);
+    e.ring = sum(sums.ring);
+    e.ring_rr = sum(sums.ring_rr);
+    e.ground = sum(sums.ground);
+    e.ground_rr = sum(sums.ground_rr);
+    e.ground_ground = sum(sums.ground_ground);
     return e;
 }
 

@@ -18,8 +18,11 @@ void select_moving(const ImageView& image, const MovingParameters& p, int limit,
 struct MovingSums {
     GaussNewtonSystem<kMovingCount> system;
     double w, wrr;
-    double ring, ring_rr;                     // weighted squared slopes, and times squared residuals
-    double ground, ground_rr, ground_ground;  // g^2, g^2 r^2 and g^4
+    double ring;           // weighted squared slopes
+    double ring_rr;        // weighted squared slopes times squared residuals
+    double ground;         // g^2
+    double ground_rr;      // g^2 r^2
+    double ground_ground;  // g^4
 };
 
 /// `spread`: variance of the ground's levels over that of the noise.

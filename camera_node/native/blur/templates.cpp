@@ -12,9 +12,10 @@ namespace {
 
 constexpr double kExtent = 1.15;  // of the grid of a known roundel, outer radii
 constexpr int kDirections = 6;
-constexpr double kLengths[] = {0.35, 0.7};               // of the motion, diameters
-constexpr int kKnownTimeSteps = 12, kNewTimeSteps = 16;  // of the exposure
-constexpr double kGroundVariance = 30;  // of a new roundel's ground, over that of other residuals
+constexpr double kLengths[] = {0.35, 0.7};  // of the motion, diameters
+constexpr int kKnownTimeSteps = 12;         // of the exposure
+constexpr int kNewTimeSteps = 16;           // of the exposure
+constexpr double kGroundVariance = 30;      // of a new roundel's ground, over that of other residuals
 
 /// The numbers of time steps in which a point sees each level.
 struct LevelCounts {
@@ -55,7 +56,8 @@ float KnownTemplate::misfit(const Levels& levels) const {
     float squares = 0, along_ground = 0;
     for (size_t k = 0; k < kPoints; ++k) {
         const float off = levels[k] - level[k];
-        squares += off * off, along_ground += off * ground[k];
+        squares += off * off;
+        along_ground += off * ground[k];
     }
     return (squares - along_ground * along_ground / ground_ground) / kPoints;
 }
@@ -100,7 +102,8 @@ NewTemplate::NewTemplate(double print_ratio, double motion_length)
             share[i].at[k] = float(shares[i]);
             for (size_t j = 0; j < 3; ++j) H[i][j] += w * shares[i] * shares[j];
         }
-        weight.at[k] = float(w), weights += float(w);
+        weight.at[k] = float(w);
+        weights += float(w);
     }
     for (size_t i = 0; i < 3; ++i) H[i][i] += 1e-3;  // short motions show some levels nowhere
     const Cholesky<3> factor(H);

@@ -19,12 +19,15 @@ struct DiscPoint {
 
 /// A moving roundel of known shape, grey levels and ratio, at 37 points. Only the ground's level is free.
 struct KnownTemplate {
-    static constexpr int kSide = 7, kPoints = kSide * kSide - 12;  // a square grid without its corners
+    static constexpr int kSide = 7;                     // of a square grid, points
+    static constexpr int kPoints = kSide * kSide - 12;  // of the grid without its corners
     using Levels = std::array<float, kPoints>;
 
-    double motion_x, motion_y;  // pixels
-    Levels level, ground;       // levels without the ground, and the ground's shares
-    float ground_ground;        // sum of the squared shares
+    double motion_x;      // pixels
+    double motion_y;      // pixels
+    Levels level;         // without the ground
+    Levels ground;        // the ground's shares
+    float ground_ground;  // sum of the squared shares
 
     /// Mean squared residual with the best level of the ground.
     float misfit(const Levels& levels) const;
@@ -46,13 +49,16 @@ class KnownTemplates {
 /// free: `solve` holds the rows of their weighted least-squares solution.
 struct NewTemplate {
     static constexpr int kAlong = 9, kAcross = 7, kPoints = kAlong * kAcross, kPadded = kPoints + 1;
-    static constexpr double kReachAlong = 2, kReachAcross = 1.2;  // of the points, radii
+    static constexpr double kReachAlong = 2;     // of the points, radii
+    static constexpr double kReachAcross = 1.2;  // of the points, radii
     struct alignas(4 * kLanes) Column {
         std::array<float, kPadded> at{};
     };
 
-    double ratio, length;                // of the print; of the motion, diameters
-    std::array<Column, 3> share, solve;  // of paper, ink and ground
+    double ratio;                 // of the print
+    double length;                // of the motion, diameters
+    std::array<Column, 3> share;  // of paper, ink and ground
+    std::array<Column, 3> solve;  // of paper, ink and ground
     Column weight;
 
     NewTemplate(double print_ratio, double motion_length);

@@ -18,14 +18,19 @@ class EdgeEllipse {
     EdgeEllipse(const Parameters& p, Edge edge)
         : p_(p), r_(radius_of(edge, p)), image_(circle_image(p, r_)), is_outer_(edge == kOuterEdge) {
         const Symmetric& S = image_.shape;
-        root_ = std::sqrt(S.det()), trace_ = std::sqrt(S.xx + S.yy + 2 * root_);
+        root_ = std::sqrt(S.det());
+        trace_ = std::sqrt(S.xx + S.yy + 2 * root_);
         B_ = {(S.xx + root_) / trace_, S.xy / trace_, (S.yy + root_) / trace_};  // B B = S
     }
 
     /// The parameters of a picture with this ellipse as the image of the unit circle.
     Parameters as_pose() const {
         Parameters p = p_;
-        p[kX] = image_.x, p[kY] = image_.y, p[kAxx] = B_.xx, p[kAxy] = B_.xy, p[kAyy] = B_.yy;
+        p[kX] = image_.x;
+        p[kY] = image_.y;
+        p[kAxx] = B_.xx;
+        p[kAxy] = B_.xy;
+        p[kAyy] = B_.yy;
         p[kGx] = p[kGy] = 0;
         return p;
     }

@@ -50,7 +50,8 @@ struct Clearance {
         const double ring = visible_within(p[kBright] - p[kDark]);
         const double card = images.card ? ring : visible_within(p[kGround] - p[kBright]);
         const double within = images.gap(kOuterEdge, kInnerEdge), beyond = images.gap(kCardEdge, kOuterEdge);
-        of[kInnerEdge] = within - ring, of[kCardEdge] = beyond - ring;
+        of[kInnerEdge] = within - ring;
+        of[kCardEdge] = beyond - ring;
         of[kOuterEdge] = std::min(within - ring, beyond - card);
     }
 };
@@ -65,8 +66,10 @@ class Strips {
             const CircleImage& e = edges.of[edge];
             const int k = edge == kCardEdge ? 0 : 1 + edge;
             const RowEllipse around(e, distance);
-            ellipses_.set(k, around), ellipses_.set(4 + k, RowEllipse(e, -distance));
-            top_ = std::min(top_, around.top), bottom_ = std::max(bottom_, around.bottom);
+            ellipses_.set(k, around);
+            ellipses_.set(4 + k, RowEllipse(e, -distance));
+            top_ = std::min(top_, around.top);
+            bottom_ = std::max(bottom_, around.bottom);
             area_ += 2 * distance * std::numbers::pi * std::sqrt(2 * (e.shape.xx + e.shape.yy));
             const double whole = std::numbers::pi * square(std::sqrt(e.shape.xx + e.shape.yy) + distance);
             most_ = std::max(most_, whole);
@@ -97,7 +100,8 @@ ROUNDEL_INLINE Lanes load_levels(const uint8_t* from, int left) {
 ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, EdgePixels& to) {
     to.expected += std::max(0, end - begin);
     if (y < 0 || y >= image.height) return;
-    begin = std::max(begin, 0), end = std::min({end, image.width, begin + EdgePixels::kMax - to.end()});
+    begin = std::max(begin, 0);
+    end = std::min({end, image.width, begin + EdgePixels::kMax - to.end()});
     const uint8_t* row = image.row(y);
     constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
     for (int u = begin; u < end; u += kLanes) {
@@ -112,17 +116,22 @@ ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, Ed
 /// Appends the pixels of row y in the strips, left to right and each pixel once.
 ROUNDEL_INLINE void append_row(const ImageView& image, int y, const Strips& strips, EdgePixels& to) {
     const Spans spans = strips.cut(float(y - to.origin_y));
-    int begin[2 * kEdges], end[2 * kEdges];  // left of the centre, then right
+    int begin[2 * kEdges];  // left of the centre, then right
+    int end[2 * kEdges];    // left of the centre, then right
     for (int k = 0; k < kEdges; ++k) {
         const bool hole = spans.has(4 + k);
-        begin[k] = spans.begin[k], end[k] = hole ? spans.begin[4 + k] : spans.end[k];
+        begin[k] = spans.begin[k];
+        end[k] = hole ? spans.begin[4 + k] : spans.end[k];
         begin[2 * kEdges - 1 - k] = hole ? spans.end[4 + k] : kNowhere;
         end[2 * kEdges - 1 - k] = spans.end[k];
     }
     int done = kNowhere;
     for (int k = 0; k < 2 * kEdges; ++k) {
         const int from = std::max(begin[k], done);
-        if (from < end[k]) append(image, y, from + to.origin_x, end[k] + to.origin_x, to), done = end[k];
+        if (from < end[k]) {
+            append(image, y, from + to.origin_x, end[k] + to.origin_x, to);
+            done = end[k];
+        }
     }
 }
 
@@ -181,7 +190,8 @@ ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& car
         const Lanes dx = load(pixels.x + k) - x0, dy = load(pixels.y + k) - y0,
                     level = load(pixels.level + k);
         const Bits outside = (dx * (xx * dx + xy * dy) + yy * dy * dy > 1.0f) & (level >= 0.0f);
-        mean.sum += outside ? level : all(0), mean.n += outside ? all(1) : all(0);
+        mean.sum += outside ? level : all(0);
+        mean.n += outside ? all(1) : all(0);
     }
 }
 

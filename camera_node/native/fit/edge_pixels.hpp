@@ -13,10 +13,11 @@ namespace roundel {
 template <int Max>
 struct PixelColumns {
     static constexpr int kMax = Max;
-    int origin_x = 0, origin_y = 0;  // of the frame, pixels of the image
-    int count = 0;                   // padded to whole lanes
-    int used = 0;                    // pixels inside the image
-    int expected = 0;                // pixels inside and outside of the image
+    int origin_x = 0;  // of the frame, pixels of the image
+    int origin_y = 0;  // of the frame, pixels of the image
+    int count = 0;     // padded to whole lanes
+    int used = 0;      // pixels inside the image
+    int expected = 0;  // pixels inside and outside of the image
     alignas(4 * kLanes) float x[kMax + kLanes], y[kMax + kLanes], level[kMax + kLanes];
     /// Pads the columns to whole lanes.
     void pad() {
@@ -29,7 +30,8 @@ struct PixelColumns {
 struct EdgePixels : PixelColumns<6144> {
     struct EdgePart {
         Edge edge;
-        int begin, count;  // whole lanes
+        int begin;  // whole lanes
+        int count;  // whole lanes
     };
     std::array<EdgePart, kEdges> parts;
     int part_count = 0;
@@ -37,7 +39,9 @@ struct EdgePixels : PixelColumns<6144> {
     void clear() { used = expected = count = part_count = padding_ = 0; }
     /// Keeps the first `n` pixels, as one part of all edges.
     void truncate(int n) {
-        expected -= used - n, used = n, count = part_count = padding_ = 0;
+        expected -= used - n;
+        used = n;
+        count = part_count = padding_ = 0;
         end_part(kAnyEdge);
     }
     /// Copies every `n`-th lane of each part.
@@ -45,8 +49,13 @@ struct EdgePixels : PixelColumns<6144> {
     int end() const { return used + padding_; }
     /// Makes a part of the pixels that were added since the last one.
     void end_part(Edge edge) {
-        while (end() % kLanes) x[end()] = y[end()] = 0, level[end()] = -1, ++padding_;
-        parts[size_t(part_count++)] = {edge, count, end() - count}, count = end();
+        while (end() % kLanes) {
+            x[end()] = y[end()] = 0;
+            level[end()] = -1;
+            ++padding_;
+        }
+        parts[size_t(part_count++)] = {edge, count, end() - count};
+        count = end();
     }
 
   private:

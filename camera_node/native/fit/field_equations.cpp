@@ -16,7 +16,8 @@ struct ShadingBasis {
     static constexpr int kSize = 2;
     ROUNDEL_INLINE void columns(const Lanes& x, const Lanes& y, const Lanes& level, const Lanes&,
                                 Lanes* to) const {
-        to[0] = level * x, to[1] = level * y;
+        to[0] = level * x;
+        to[1] = level * y;
     }
 };
 
@@ -29,9 +30,13 @@ struct FieldBasis {
         Lanes X = x, Y = y, f[kLightFields];
         plane.map(X, Y);
         functions_of_light(X, Y, f);
-        for (int i = 0; i < kLightFields; ++i) to[kLight + i] = level * f[i], to[kGloss + i] = f[i];
+        for (int i = 0; i < kLightFields; ++i) {
+            to[kLight + i] = level * f[i];
+            to[kGloss + i] = f[i];
+        }
         const Lanes by = -2.0f * ring * X * plane.stretch(X, Y);
-        to[kBend] = by * f[2], to[kBend + 1] = by * f[3];
+        to[kBend] = by * f[2];
+        to[kBend + 1] = by * f[3];
     }
 };
 
@@ -66,7 +71,11 @@ struct PartPixels {
     const float *x, *y, *level;
     PartPixels(const EdgePixels& pixels, const LinearPart& part)
         : x(pixels.x + part.begin), y(pixels.y + part.begin), level(pixels.level + part.begin) {}
-    ROUNDEL_INLINE void next_chunk() { x += kChunk * kLanes, y += kChunk * kLanes, level += kChunk * kLanes; }
+    ROUNDEL_INLINE void next_chunk() {
+        x += kChunk * kLanes;
+        y += kChunk * kLanes;
+        level += kChunk * kLanes;
+    }
 };
 
 template <Edge edge, typename Basis>
@@ -147,13 +156,17 @@ ROUNDEL_CLONES void add_scores(const LinearPart& part, PartPixels at, const Fiel
                 plane.map(X, Y);
                 const Lanes xx = X * X, yy = Y * Y, xy = X * Y, rr = xx + yy;
                 const Lanes by = -chunks->ring[k] * plane.stretch(X, Y), by_r = wr * by;
-                sums.cos3 += by_r * X * (xx - 3.0f * yy), sums.sin3 += by_r * Y * (3.0f * xx - yy);
+                sums.cos3 += by_r * X * (xx - 3.0f * yy);
+                sums.sin3 += by_r * Y * (3.0f * xx - yy);
                 const Lanes information = w * by * by * rr * rr * rr;
-                sums.bend += information, sums.processing += information * rr;
-                sums.cos4 += by_r * (rr * rr - 8.0f * xx * yy), sums.sin4 += by_r * 4.0f * xy * (xx - yy);
+                sums.bend += information;
+                sums.processing += information * rr;
+                sums.cos4 += by_r * (rr * rr - 8.0f * xx * yy);
+                sums.sin4 += by_r * 4.0f * xy * (xx - yy);
                 const Bits card = plane.is_card(rr);
                 const Lanes on_card = card ? wr : all(0), w_card = card ? w : all(0);
-                sums.cos2 += on_card * (xx - yy), sums.sin2 += on_card * xy;
+                sums.cos2 += on_card * (xx - yy);
+                sums.sin2 += on_card * xy;
                 sums.light += w_card * rr * rr;
             }
     });

@@ -12,10 +12,12 @@ namespace {
 constexpr int kFieldSteps = 8;
 constexpr double kFirstScale = 0.1;   // of the contrast: residuals of the first step
 constexpr double kFieldChange = 0.1;  // of a standard deviation: a smaller step ends the iteration
-// Standard deviations of the fields: light over its mean, and gloss over the contrast, both up to second
-// order and of third order, and the height of bent paper over its width, as displacement with three periods
-// at a tilt of 45 degrees.
-constexpr double kLightSigma = 0.3, kCubicSigma = 0.05, kBendSigma = 0.02, kLeastTilt = 0.05;
+// Standard deviations of the fields:
+constexpr double kLightSigma = 0.3;   // light over its mean, and gloss over the contrast, up to second order
+constexpr double kCubicSigma = 0.05;  // the same of third order
+constexpr double kBendSigma = 0.02;   // height of bent paper over its width, as displacement with three
+                                      // periods at a tilt of 45 degrees
+constexpr double kLeastTilt = 0.05;
 // Residuals from which a fit is no roundel on bent paper, over the contrast: a bend of 2 % leaves 0.14 at 160
 // px.
 constexpr double kMaxBentResidual = 0.2;
@@ -53,13 +55,16 @@ Vector<kFields> PhotometricFitter::field_prior() const {
 /// Gauss-Newton steps of the parameters and the fields. The pixels are selected again for each, since the
 /// fields change their places and levels.
 bool PhotometricFitter::fit_fields() {
-    fields_ = {FieldFrame(p_), {}}, has_fields_ = true;
-    fields_.frame.x += pixels_.origin_x, fields_.frame.y += pixels_.origin_y;
+    fields_ = {FieldFrame(p_), {}};
+    has_fields_ = true;
+    fields_.frame.x += pixels_.origin_x;
+    fields_.frame.y += pixels_.origin_y;
     const Vector<kFields> prior = field_prior();
     const double ground = spread_;  // that the fit in even light shows
     for (int k = 0; k < kFieldSteps; ++k) {
         if (!select(whole_band(), EdgePixels::kMax)) return false;
-        equations_.linearize(pixels_, p_), linearized_at_ = p_;
+        equations_.linearize(pixels_, p_);
+        linearized_at_ = p_;
         const double seen = edge_scale();
         // The first step weights all pixels: what the fields explain shall not count as outliers.
         scale_ = k ? std::clamp(scale_, kStrictScale * seen, kSlackScale * seen)
@@ -81,7 +86,8 @@ bool PhotometricFitter::fit_fields() {
 bool PhotometricFitter::step_with_fields(const Vector<kFields>& prior, double& moved) {
     Parameters step = factor_->solve(system_.g);
     FieldFrame frame = fields_.frame;
-    frame.x -= pixels_.origin_x, frame.y -= pixels_.origin_y;
+    frame.x -= pixels_.origin_x;
+    frame.y -= pixels_.origin_y;
     const auto products = field_products(equations_, pixels_, frame, {scale_, spread_});
     std::array<Vector<kFields>, kFields> S = products.own;
     std::array<Parameters, kFields> half;
@@ -145,14 +151,20 @@ void PhotometricFitter::allow_shading() {
     double ex = products.residuals[0] / slope_, ey = products.residuals[1] / slope_;
     for (int i = 0; i < kCount; ++i) {
         const double step = p_[i] - linearized_at_[i];
-        ex -= Cx[i] * step, ey -= Cy[i] * step;
-        S.xx -= yx[i] * yx[i], S.xy -= yx[i] * yy[i], S.yy -= yy[i] * yy[i];
+        ex -= Cx[i] * step;
+        ey -= Cy[i] * step;
+        S.xx -= yx[i] * yx[i];
+        S.xy -= yx[i] * yy[i];
+        S.yy -= yy[i] * yy[i];
     }
     if (!(S.det() > 0 && S.xx > 0)) return;
     shading_ = {(S.yy * ex - S.xy * ey) / S.det(), (S.xx * ey - S.xy * ex) / S.det(),
                 square(noise_) * (S.xx + S.yy) / (2 * S.det())};
     const double prior = square(noise_ / light_.sigma);
-    S.xx += prior, S.yy += prior, ex += prior * light_.x, ey += prior * light_.y;
+    S.xx += prior;
+    S.yy += prior;
+    ex += prior * light_.x;
+    ey += prior * light_.y;
     const double det = S.det();
     const double sx = (S.yy * ex - S.xy * ey) / det, sy = (S.xx * ey - S.xy * ex) / det;
     const auto Kx = factor_->solve_tail<kPoseCount>(yx), Ky = factor_->solve_tail<kPoseCount>(yy);

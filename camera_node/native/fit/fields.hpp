@@ -26,10 +26,13 @@ ROUNDEL_INLINE void functions_of_light(const T& X, const T& Y, T (&f)[kLightFiel
 
 /// The coordinates X and Y of pixels, for the pose in `p`.
 struct FieldFrame {
-    double x = 0, y = 0;          // of the disc's centre
-    double minor = 1, major = 1;  // half axes
-    double cos = 1, sin = 0;      // direction of the minor axis
-    double reach = 1;             // of the card, up to which only its own light shows, outer radii
+    double x = 0;      // of the disc's centre
+    double y = 0;      // of the disc's centre
+    double minor = 1;  // half axis
+    double major = 1;  // half axis
+    double cos = 1;    // of the direction of the minor axis
+    double sin = 0;    // of the direction of the minor axis
+    double reach = 1;  // of the card, up to which only its own light shows, outer radii
 
     FieldFrame() = default;
     explicit FieldFrame(const Parameters& p);
@@ -54,7 +57,8 @@ class FieldPlane {
     /// Replaces pixels by coordinates in the plane.
     ROUNDEL_INLINE void map(Lanes& x, Lanes& y) const {
         const Lanes dx = x - x_, dy = y - y_;
-        x = xx_ * dx + xy_ * dy, y = yx_ * dx + yy_ * dy;
+        x = xx_ * dx + xy_ * dy;
+        y = yx_ * dx + yy_ * dy;
     }
     /// Pixels by which an ellipse moves outwards at (X, Y), over |(X, Y)|, if it grows by one minor axis.
     ROUNDEL_INLINE Lanes stretch(const Lanes& X, const Lanes& Y) const {

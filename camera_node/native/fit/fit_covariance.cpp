@@ -13,7 +13,12 @@ PoseCovariance output_jacobian(const Parameters& p) {
     const double gx = p[kGx], gy = p[kGy];
     const Vector<kPoseCount> hx{0, 0, gx, gy, 0, p[kAxx], p[kAxy]}, hy{0, 0, 0, gx, gy, p[kAxy], p[kAyy]};
     PoseCovariance J{};
-    for (int k = 0; k < kPoseCount; ++k) J[0][k] = -hx[k], J[1][k] = -hy[k], J[5][k] = hx[k], J[6][k] = hy[k];
+    for (int k = 0; k < kPoseCount; ++k) {
+        J[0][k] = -hx[k];
+        J[1][k] = -hy[k];
+        J[5][k] = hx[k];
+        J[6][k] = hy[k];
+    }
     for (int k = 0; k < 5; ++k) J[k][k] += 1;
     return J;
 }
@@ -38,10 +43,16 @@ RoundelFit make_fit(const Parameters& p, const PoseCovariance& pose, int origin_
     RoundelFit fit{};
     fit.outer = {outer.x + origin_x, outer.y + origin_y, 2 * std::sqrt(axes.first),
                  2 * std::sqrt(axes.second), axes.angle};
-    fit.offset_x = p[kX] - outer.x, fit.offset_y = p[kY] - outer.y;
+    fit.offset_x = p[kX] - outer.x;
+    fit.offset_y = p[kY] - outer.y;
     fit.pose_cov = propagate(output_jacobian(p), pose);
-    fit.ratio = p[kRatio], fit.dark = p[kDark], fit.bright = p[kBright], fit.blur = p[kBlur];
-    fit.p = p, fit.p[kX] += origin_x, fit.p[kY] += origin_y;
+    fit.ratio = p[kRatio];
+    fit.dark = p[kDark];
+    fit.bright = p[kBright];
+    fit.blur = p[kBlur];
+    fit.p = p;
+    fit.p[kX] += origin_x;
+    fit.p[kY] += origin_y;
     return fit;
 }
 

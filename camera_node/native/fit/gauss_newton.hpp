@@ -21,10 +21,16 @@ inline Parameters initial_parameters(const InitialGuess& guess, int origin_x, in
     const double c = std::cos(guess.outer.angle), n = std::sin(guess.outer.angle);
     const double a = guess.outer.major / 2, b = guess.outer.minor / 2;
     Parameters p{};
-    p[kX] = guess.outer.x - origin_x, p[kY] = guess.outer.y - origin_y;
-    p[kAxx] = a * c * c + b * n * n, p[kAxy] = (a - b) * c * n, p[kAyy] = a * n * n + b * c * c;
-    p[kRatio] = guess.ratio, p[kCard] = kCardRatio, p[kBlur] = blur;
-    p[kDark] = guess.dark, p[kBright] = p[kGround] = guess.bright;
+    p[kX] = guess.outer.x - origin_x;
+    p[kY] = guess.outer.y - origin_y;
+    p[kAxx] = a * c * c + b * n * n;
+    p[kAxy] = (a - b) * c * n;
+    p[kAyy] = a * n * n + b * c * c;
+    p[kRatio] = guess.ratio;
+    p[kCard] = kCardRatio;
+    p[kBlur] = blur;
+    p[kDark] = guess.dark;
+    p[kBright] = p[kGround] = guess.bright;
     return p;
 }
 
@@ -33,7 +39,9 @@ inline Parameters initial_parameters(const InitialGuess& guess, int origin_x, in
 inline Parameters prior_information(double major, double ratio, double blur) {
     const auto from_sigma = [](double sigma) { return 1 / (sigma * sigma); };
     Parameters w{};
-    w[kRatio] = from_sigma(ratio), w[kCard] = from_sigma(0.05), w[kGround] = from_sigma(100);
+    w[kRatio] = from_sigma(ratio);
+    w[kCard] = from_sigma(0.05);
+    w[kGround] = from_sigma(100);
     w[kBlur] = from_sigma(blur);
     const double perspective = kShortestFocal / (major / 2);  // g = r / f sin(tilt)
     w[kGx] = w[kGy] = perspective * perspective;
@@ -42,10 +50,12 @@ inline Parameters prior_information(double major, double ratio, double blur) {
 
 /// How far an estimate may be from its initial guess.
 struct SanityLimits {
-    double shift;                // of the centre, mean radii; one pixel more is always allowed
-    double min_size, max_size;   // mean radius over that of the guess
-    double blur;                 // mean radii; three pixels more are always allowed
-    double underflow, overflow;  // grey levels below 0 and above 255
+    double shift;      // of the centre, mean radii; one pixel more is always allowed
+    double min_size;   // mean radius over that of the guess
+    double max_size;   // mean radius over that of the guess
+    double blur;       // mean radii; three pixels more are always allowed
+    double underflow;  // grey levels below 0
+    double overflow;   // grey levels above 255
 };
 
 /// J^T W J, of which the lower triangle is set, and J^T W r.
@@ -92,7 +102,9 @@ class GaussNewton {
                square(at(kGx)) + square(at(kGy)) < square(0.5 / at(kCard));
     }
 
-    Vector<N> p_{}, start_{}, prior_{};  // the estimate, the mean of the prior and its information
+    Vector<N> p_{};      // the estimate
+    Vector<N> start_{};  // the mean of the prior
+    Vector<N> prior_{};  // the information of the prior
     std::optional<Cholesky<N>> factor_;
 
   private:

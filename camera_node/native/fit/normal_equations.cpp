@@ -121,7 +121,9 @@ ROUNDEL_INLINE void add_residuals(const Lanes& r, const Gradient& at, int k, con
     sums.mpsi += squared * root * (1.0f - 5.0f * t * t);
     if constexpr (edge == kOuterEdge || edge == kInnerEdge) return;
     const Lanes share = at.residual[k] < kAbsent ? at.by[kGround][k] : all(0), gg = share * share;
-    sums.ground += gg, sums.ground_rr += gg * rr, sums.ground_ground += gg * gg;
+    sums.ground += gg;
+    sums.ground_rr += gg * rr;
+    sums.ground_ground += gg * gg;
 }
 
 /// `delta` is a step of the parameters of the part's gradient.
@@ -155,7 +157,8 @@ ROUNDEL_INLINE void add_every(int step, const Gradient* chunks, int lanes, Sampl
     for (int k = 0; k < lanes; k += step, ++to.n) {
         const Gradient& at = chunks[k / kChunk];
         const Lanes residual = magnitude(at.residual[k % kChunk]), slope = magnitude(at.ring[k % kChunk]);
-        to.residuals[to.n] = residual, to.slopes[to.n] = slope;
+        to.residuals[to.n] = residual;
+        to.slopes[to.n] = slope;
         const Lanes seen = residual < kAbsent ? slope : all(0);
         to.most = seen > to.most ? seen : to.most;
     }
@@ -185,7 +188,9 @@ void NormalEquations::linearize(const EdgePixels& pixels, const Parameters& p) {
     for (int k = 0; k < part_count_; ++k) {
         const EdgePixels::EdgePart& from = pixels.parts[size_t(k)];
         LinearPart& part = parts_[size_t(k)];
-        part.edge = from.edge, part.lanes = from.count / kLanes, part.begin = from.begin;
+        part.edge = from.edge;
+        part.lanes = from.count / kLanes;
+        part.begin = from.begin;
         part.chunks = chunks;
         if (part.edge == kAnyEdge) {
             evaluate(pixels, from, p, chunks);

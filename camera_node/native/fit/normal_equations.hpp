@@ -13,13 +13,19 @@ namespace roundel {
 
 /// Sums over the residuals r - J delta that a step delta leaves to first order.
 struct ResidualSums {
-    double ring, agreeing;  // of squared slopes of the ring's edges, unweighted and weighted
-    double ring_rr;         // of squared residuals times these slopes
-    /// Sums of w m, w m^2, w m r^2, w^2 m r^2 and m psi'. m is the squared slope of the level (a pixel's
-    /// information on the edges), w Tukey's weight, psi = w r.
-    double m, mm, mrr, mwrr, mpsi;
-    /// Sums of g^2, g^2 r^2 and g^4, unweighted. g is the share of the ground in a pixel.
-    double ground, ground_rr, ground_ground;
+    double ring;      // of squared slopes of the ring's edges, unweighted
+    double agreeing;  // of squared slopes of the ring's edges, weighted
+    double ring_rr;   // of squared residuals times these slopes
+    // Below, m is the squared slope of the level (a pixel's information on the edges), w Tukey's weight,
+    // psi = w r, and g the share of the ground in a pixel.
+    double m;              // w m
+    double mm;             // w m^2
+    double mrr;            // w m r^2
+    double mwrr;           // w^2 m r^2
+    double mpsi;           // m psi'
+    double ground;         // g^2
+    double ground_rr;      // g^2 r^2
+    double ground_ground;  // g^4
 };
 
 /// The normal equations of weighted least squares: the model's levels at all pixels, linearized at one point

@@ -39,7 +39,9 @@ class SectorIndex {
     explicit SectorIndex(const Parameters& p)
         : x_(float(p[kX])), y_(float(p[kY])), between_(float((1 + p[kRatio]) * (1 + p[kRatio]) / 4)) {
         const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
-        xx_ = float(p[kAyy] / det), xy_ = float(-p[kAxy] / det), yy_ = float(p[kAxx] / det);
+        xx_ = float(p[kAyy] / det);
+        xy_ = float(-p[kAxy] / det);
+        yy_ = float(p[kAxx] / det);
     }
     /// The number of a sector of the outer edge, or kSectors plus that of a sector of the inner edge.
     ROUNDEL_INLINE Bits locate(const Lanes& x, const Lanes& y) const {
@@ -106,7 +108,9 @@ ROUNDEL_CLONES void remove_occluded(const OcclusionMask& occlusion, const Parame
         for (int k = 0; k < std::min(kLanes, pixels.used - begin); ++k) {
             const Sectors occluded = place[k] < kSectors ? occlusion.outer : occlusion.inner;
             if (occluded >> (place[k] % kSectors) & 1) continue;
-            pixels.x[n] = x[k], pixels.y[n] = y[k], pixels.level[n++] = level[k];
+            pixels.x[n] = x[k];
+            pixels.y[n] = y[k];
+            pixels.level[n++] = level[k];
         }
     }
     pixels.truncate(n);
@@ -115,7 +119,9 @@ ROUNDEL_CLONES void remove_occluded(const OcclusionMask& occlusion, const Parame
 void SectorSums::add(int sector, double slope, double residual) {
     const auto s = size_t(sector);
     const double w = std::abs(slope);
-    rr_[s] += w * residual * residual, weight_[s] += w, squared_[s] += w * w;
+    rr_[s] += w * residual * residual;
+    weight_[s] += w;
+    squared_[s] += w * w;
     regression_[s] += slope * residual;
 }
 
@@ -143,10 +149,13 @@ Displacement SectorSums::displacement(double noise) const {
         double across = 0, along = 0;
         for (int k = s - kAround; k <= s + kAround; ++k) {
             const auto at = size_t(k + kSectors) % kSectors;
-            across += regression_[at], along += squared_[at];
+            across += regression_[at];
+            along += squared_[at];
         }
         if (along <= least) continue;
-        sum += across * across / (along * along), chance += noise * noise / along, ++seen;
+        sum += across * across / (along * along);
+        chance += noise * noise / along;
+        ++seen;
     }
     const double n = std::max(seen, 1);
     return {std::sqrt(sum / n), std::sqrt(chance / n)};
@@ -158,18 +167,25 @@ void SectorSums::add_scatter(Sectors masked, double& sum, int& count) const {
         Sectors used = 0;
         for (int k = s - kAround; k <= s + kAround; ++k) {
             const auto at = size_t(k + kSectors) % kSectors;
-            across += regression_[at], along += squared_[at], used |= Sectors(1) << at;
+            across += regression_[at];
+            along += squared_[at];
+            used |= Sectors(1) << at;
         }
-        if (along > 0 && !(used & masked)) sum += across * across / along, ++count;
+        if (along > 0 && !(used & masked)) {
+            sum += across * across / along;
+            ++count;
+        }
     }
 }
 
 EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p, const Fields& fields)
     : circles_{circle_image(p, 1), circle_image(p, p[kRatio])} {
     EdgePixels pixels;
-    pixels.origin_x = int(std::lround(p[kX])), pixels.origin_y = int(std::lround(p[kY]));
+    pixels.origin_x = int(std::lround(p[kX]));
+    pixels.origin_y = int(std::lround(p[kY]));
     Parameters local = p;
-    local[kX] -= pixels.origin_x, local[kY] -= pixels.origin_y;
+    local[kX] -= pixels.origin_x;
+    local[kY] -= pixels.origin_y;
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
     if (fields.any()) fields.remove_from(pixels);
     add_misfit(pixels, Model(local), SectorIndex(local), edges_);
@@ -192,7 +208,8 @@ OcclusionMask EdgeMisfit::occlusion(double noise, double slack) const {
 double EdgeMisfit::correlation(double noise, const OcclusionMask& mask) const {
     double sum = 0;
     int count = 0;
-    edges_[0].add_scatter(mask.outer, sum, count), edges_[1].add_scatter(mask.inner, sum, count);
+    edges_[0].add_scatter(mask.outer, sum, count);
+    edges_[1].add_scatter(mask.inner, sum, count);
     return count ? std::max(1.0, kAbsorbed * sum / (count * noise * noise)) : 1;
 }
 

@@ -13,8 +13,10 @@ namespace roundel {
 namespace {
 
 // Half widths of the bands of pixels around an edge: at least so many pixels, and so many blurs.
-constexpr double kNarrow = 1.25, kNarrowBlurs = 1.5;
-constexpr double kWide = 2.5, kWideBlurs = 2.5;
+constexpr double kNarrow = 1.25;
+constexpr double kNarrowBlurs = 1.5;
+constexpr double kWide = 2.5;
+constexpr double kWideBlurs = 2.5;
 constexpr double kMinCardStep = 0.2;  // of the contrast: a smaller step from card to ground is not fitted
 
 constexpr int kCoarsePixels = 200;
@@ -33,7 +35,8 @@ constexpr double kGroundChance = 4;  // standard deviations of the ground's resi
 constexpr double kEvenGround = 4;    // spread that halves the weight of pixels at the card's edge
 constexpr double kReweighed = 0.1;   // of a step that changes the weights of residuals: what is left of it
 constexpr double kInitialBlur = 0.8;
-constexpr double kRatioPrior = 0.3, kBlurPrior = 1;  // standard deviations
+constexpr double kRatioPrior = 0.3;    // standard deviation
+constexpr double kBlurPrior = 1;       // standard deviation
 constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
 
 /// Sets bright pixels to the scale's end if many are there, since compression scatters the levels of clipped
@@ -60,8 +63,12 @@ PhotometricFitter::PhotometricFitter(const ImageView& image, const InitialGuess&
     p_ = start_ = initial_parameters(guess, pixels_.origin_x, pixels_.origin_y, kInitialBlur);
     prior_ = prior_information(guess.outer.major, kRatioPrior, kBlurPrior);
     if (!resumed_) return;
-    p_ = *guess.model, start_[kGround] = p_[kGround], scale_ = guess.noise, spread_ = guess.ground;
-    p_[kX] -= pixels_.origin_x, p_[kY] -= pixels_.origin_y;
+    p_ = *guess.model;
+    start_[kGround] = p_[kGround];
+    scale_ = guess.noise;
+    spread_ = guess.ground;
+    p_[kX] -= pixels_.origin_x;
+    p_[kY] -= pixels_.origin_y;
 }
 
 /// Iterates on a subset of the pixels, from an initial guess to near the solution.
@@ -110,7 +117,8 @@ bool PhotometricFitter::resume() {
 bool PhotometricFitter::iterate(const EdgePixels& pixels, int steps_to_go) {
     const bool coarse = steps_to_go > 1;
     for (int k = 0; k < kMaxSteps; ++k) {
-        equations_.linearize(pixels, p_), linearized_at_ = p_;
+        equations_.linearize(pixels, p_);
+        linearized_at_ = p_;
         const double seen = edge_scale();
         if (resumed_ && coarse && seen < kSlackScale * scale_) return true;
         if (resumed_ && (k == kMaxResumedSteps || seen > kMaxResumedMisfit * contrast())) return false;
@@ -136,8 +144,11 @@ bool PhotometricFitter::is_converged(double left) const {
 bool PhotometricFitter::sees_clutter() const { return !has_fields_ && !spread_ && ground_ > kEvenGround; }
 
 bool PhotometricFitter::weigh_ground() {
-    spread_ = ground_, p_ = linearized_at_;
-    posterior_ratio_ = 0, print_effect_ = curvature_effect_ = {}, shading_effect_ = {};
+    spread_ = ground_;
+    p_ = linearized_at_;
+    posterior_ratio_ = 0;
+    print_effect_ = curvature_effect_ = {};
+    shading_effect_ = {};
     const double scale = scale_;
     if (!solve(scale)) return false;
     const double left = kReweighed * advance(scale);
@@ -209,12 +220,16 @@ RoundelFit PhotometricFitter::fit() const {
     RoundelFit fit = make_fit(print, pose_covariance(), pixels_.origin_x, pixels_.origin_y);
     for (const int i : {kAxx, kAyy, kRatio}) fit.p[i] = p_[i];
     if (posterior_ratio_ > 0) fit.p[kRatio] = posterior_ratio_;
-    fit.ratio = ratio(), fit.curvature = expected_curvature_;
+    fit.ratio = ratio();
+    fit.curvature = expected_curvature_;
     fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
-    fit.noise = scale_, fit.ground = spread_ && ground_ > kEvenGround ? ground_ : 0;
-    fit.shading = shading_, fit.clipped = clipped_;
-    fit.uneven = scores_.light > kUnlikelyField, fit.fields = fields_;
+    fit.noise = scale_;
+    fit.ground = spread_ && ground_ > kEvenGround ? ground_ : 0;
+    fit.shading = shading_;
+    fit.clipped = clipped_;
+    fit.uneven = scores_.light > kUnlikelyField;
+    fit.fields = fields_;
     fit.bend = bend();
     fit.support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected;
     return fit;

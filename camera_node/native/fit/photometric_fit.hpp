@@ -70,21 +70,24 @@ struct Bend {
 /// A roundel fitted to the grey levels around its edges.
 struct RoundelFit {
     Ellipse outer;
-    double offset_x, offset_y;  // from the ellipse's centre to the image of the disc's centre, pixels
+    double offset_x;  // from the ellipse's centre to the image of the disc's centre, pixels
+    double offset_y;  // from the ellipse's centre to the image of the disc's centre, pixels
     PoseCovariance pose_cov;
     double ratio;          // inner over outer diameter, measured without the prior of the print
     double ratio_sigma;    // its standard deviation
     double curvature = 0;  // of the tone curve, whose effect was removed from ratio and outline
-    double dark, bright;   // grey levels
+    double dark;           // grey level
+    double bright;         // grey level
     double blur;           // standard deviation of the edges' spread including the pixel's width, pixels
     double edge_residual;  // RMS over the ring's edges, each pixel weighted by its squared slope
     double support;        // share of the ring's edges that is in the image and agrees with the model
     /// Parameters of the model that describes the image, in its frame: with the effect of the tone curve, and
     /// the ratio given a known print.
     Parameters p;
-    bool unoccluded = false;            // the fit uses the unmodified image, all around
-    double motion_x = 0, motion_y = 0;  // during the exposure, if it was fitted, pixels
-    double noise = 0;                   // standard deviation of the residuals, grey levels
+    bool unoccluded = false;  // the fit uses the unmodified image, all around
+    double motion_x = 0;      // during the exposure, if it was fitted, pixels
+    double motion_y = 0;      // during the exposure, if it was fitted, pixels
+    double noise = 0;         // standard deviation of the residuals, grey levels
     /// How much less pixels count that see the ground: its variance over that of the noise, times the pixels
     /// of a patch of it; 0 if all pixels count alike.
     double ground = 0;

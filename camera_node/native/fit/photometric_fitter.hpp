@@ -14,9 +14,9 @@ namespace roundel {
 constexpr SanityLimits kFitLimits{
     .shift = 0.1, .min_size = 0.7, .max_size = 1.4, .blur = 0.1, .underflow = 64, .overflow = 600};
 
-// Bounds of the scale of residuals over that of the current ones: the upper one is the tolerance of a median
-// of few residuals.
-constexpr double kStrictScale = 0.5, kSlackScale = 1.3;
+// Bounds of the scale of residuals over that of the current ones
+constexpr double kStrictScale = 0.5;
+constexpr double kSlackScale = 1.3;  // the tolerance of a median of few residuals
 
 constexpr double kSeparateBlurs = 4;    // of wide bands that contain a single edge, and of plateaus
 constexpr float kClippedPlateau = 235;  // level that compression leaves of clipped paper
@@ -98,12 +98,14 @@ class PhotometricFitter : GaussNewton<kCount> {
     Vector<kPoseCount> print_effect_{};  // its outer product is what the print takes off the covariance
     double posterior_ratio_ = 0;         // given the print; 0 if no print is known
     double scale_ = 255, noise_ = 0, slope_ = 1;
-    double spread_ = 0, ground_ = 0;  // of the ground: in the last solution, and as its residuals show
+    double spread_ = 0;  // of the ground, in the last solution
+    double ground_ = 0;  // of the ground, as the residuals show
     bool resumed_, clipped_ = false;
     LightGradient light_;
     double curvature_sigma_ = 0;
     const ToneRemainder* tone_;
-    double expected_curvature_ = 0, curvature_ = 0;  // of the tone curve: before and after the print is used
+    double expected_curvature_ = 0;  // of the tone curve, before the print is used
+    double curvature_ = 0;           // of the tone curve, after the print is used
     Vector<kPoseCount>
         curvature_effect_{};  // its outer product is what the tone curve adds to the covariance
     Shading shading_;

@@ -29,7 +29,8 @@ bool PhotometricFitter::condition_on_plateau(Parameter level, const Plateau& pla
     for (const double x : factor_->halfway(unit)) variance += square(x);
     const double off = plateau.mean - p_[level], n = plateau.count;
     if (square(off) > square(kMaxPlateauError * noise_) * variance) return false;
-    system_.H[level][level] += n, g[level] = n * off;
+    system_.H[level][level] += n;
+    g[level] = n * off;
     return true;
 }
 

@@ -17,18 +17,23 @@ constexpr double kMostPixels = 4000;  // of the disc: levels are then known to a
 /// Sums of levels and of their squares, below 2^31 for 30,000 pixels.
 struct LevelSums {
     int count = 0, sum = 0, squares = 0;
-    Bits sums{}, squares_of{};  // the same, by lanes
+    Bits sums{};        // `sum` by lanes
+    Bits squares_of{};  // `squares` by lanes
 
     ROUNDEL_INLINE void add(const uint8_t* levels) {
         uint64_t bytes;
         __builtin_memcpy(&bytes, levels, sizeof bytes);
         const Bits level = widen(bytes);
-        sums += level, squares_of += level * level;
+        sums += level;
+        squares_of += level * level;
     }
     Plateau mean() const {
         if (count == 0) return {};
         int64_t total = sum, of_squares = squares;
-        for (int k = 0; k < kLanes; ++k) total += sums[k], of_squares += squares_of[k];
+        for (int k = 0; k < kLanes; ++k) {
+            total += sums[k];
+            of_squares += squares_of[k];
+        }
         const double m = double(total) / count;
         return {count, m, double(of_squares) / count - m * m};
     }
@@ -42,11 +47,15 @@ struct Rows {
     /// Adds the pixels [begin, end) of row y that are inside the image.
     ROUNDEL_INLINE void add(int y, int begin, int end, LevelSums& sums) const {
         if (y + origin_y < 0 || y + origin_y >= image.height) return;
-        begin = std::max(begin + origin_x, 0), end = std::min(end + origin_x, image.width);
+        begin = std::max(begin + origin_x, 0);
+        end = std::min(end + origin_x, image.width);
         const uint8_t* row = image.row(y + origin_y);
         int u = begin;
         for (; u + kLanes <= end; u += kLanes) sums.add(row + u);
-        for (; u < end; ++u) sums.sum += row[u], sums.squares += row[u] * row[u];
+        for (; u < end; ++u) {
+            sums.sum += row[u];
+            sums.squares += row[u] * row[u];
+        }
         sums.count += std::max(0, end - begin);
     }
 };

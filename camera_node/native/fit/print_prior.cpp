@@ -31,7 +31,8 @@ Parameters PhotometricFitter::effect_of_curvature(double curvature) const {
     const double shift = curvature * kEdgeShift * p_[kBlur];
     const double radius = std::sqrt(p_[kAxx] * p_[kAyy] - square(p_[kAxy]));
     Parameters effect{};
-    effect[kAxx] = effect[kAyy] = -shift, effect[kRatio] = shift * (1 + p_[kRatio]) / radius;
+    effect[kAxx] = effect[kAyy] = -shift;
+    effect[kRatio] = shift * (1 + p_[kRatio]) / radius;
     return effect;
 }
 
@@ -73,8 +74,12 @@ void PhotometricFitter::use_print(const Print& print) {
     const double off = print.ratio + effect_of_curvature(expected_curvature_)[kRatio] - p_[kRatio];
     for (int i = 0; i < kCount; ++i) p_[i] += with[i] * off / with[kRatio];
     if (is_sane(kFitLimits)) {
-        equations_.linearize(pixels_, p_), linearized_at_ = p_;
-        if (solve(scale_) && (advance(scale_), is_sane(kFitLimits)) && condition_on_print(print)) return;
+        equations_.linearize(pixels_, p_);
+        linearized_at_ = p_;
+        if (solve(scale_)) {
+            advance(scale_);
+            if (is_sane(kFitLimits) && condition_on_print(print)) return;
+        }
     }
     std::tie(p_, factor_, sums_, noise_, scale_) = saved;
 }

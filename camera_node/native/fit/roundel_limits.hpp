@@ -31,8 +31,9 @@ struct RoundelLimits {
     std::vector<Print> prints{{0.6}, {0.41}};  // in use
     bool any_print = false;                    // other rings may be roundels, too
     double ratio_tolerance = 0.08;
-    double min_diameter = 8, max_diameter = 400;  // major axis of the outer ellipse, pixels
-    double min_contrast = 25;                     // bright minus dark level, grey levels
+    double min_diameter = 8;    // major axis of the outer ellipse, pixels
+    double max_diameter = 400;  // major axis of the outer ellipse, pixels
+    double min_contrast = 25;   // bright minus dark level, grey levels
 
     // Prints that are not known in advance: least and greatest ratio, the tolerance of a measured one, and
     // the least diameter, pixels, at which it tells a print from a letter.

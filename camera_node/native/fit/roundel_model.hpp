@@ -55,9 +55,10 @@ inline CircleImage circle_image(const Parameters& p, double r) {
 constexpr float kAbsent = 1e9f;  // a residual that does not count
 
 /// Pixels that do not count: padding (level -1), and clipped pixels whose modelled `level` is out of range.
+constexpr float kSaturated = 254.5f;
 // Noise that lifts a pixel to the scale's end is cut off, so clipped pixels count only if the model is far
 // below.
-constexpr float kSaturated = 254.5f, kClipped = 225;
+constexpr float kClipped = 225;
 ROUNDEL_INLINE Bits is_uninformative(const Lanes& seen, const Lanes& level) {
     const Bits clipped = ((seen > kSaturated) & (level > kClipped)) | ((seen < 0.5f) & (level < 0.0f));
     return (seen < 0.0f) | clipped;
@@ -84,15 +85,26 @@ class ModelOf {
     explicit ModelOf(const Parameters& p) {
         const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy], blur = p[kBlur];
         const double xx = p[kAyy] / det, xy = -p[kAxy] / det, yy = p[kAxx] / det;
-        x_ = float(p[kX]), y_ = float(p[kY]), gx_ = float(p[kGx]), gy_ = float(p[kGy]);
-        inverse_xx_ = float(xx), inverse_xy_ = float(xy), inverse_yy_ = float(yy);
-        ratio_ = float(p[kRatio]), card_ = float(p[kCard]);
-        bright_ = float(p[kBright]), fall_ = float(p[kDark] - p[kBright]);
+        x_ = float(p[kX]);
+        y_ = float(p[kY]);
+        gx_ = float(p[kGx]);
+        gy_ = float(p[kGy]);
+        inverse_xx_ = float(xx);
+        inverse_xy_ = float(xy);
+        inverse_yy_ = float(yy);
+        ratio_ = float(p[kRatio]);
+        card_ = float(p[kCard]);
+        bright_ = float(p[kBright]);
+        fall_ = float(p[kDark] - p[kBright]);
         drop_ = float(p[kGround] - p[kBright]);
-        zgx_ = float(xx * p[kGx] + xy * p[kGy]), zgy_ = float(xy * p[kGx] + yy * p[kGy]);
-        turn_ = float((yy * yy - xx * xx) * kRootHalf), shear_ = float(xy * (xx + yy) * kRootHalf);
-        per_blur_ = float(1 / blur), peak_ = float(-kPeak / blur);
-        half_bend_ = float(blur / (2 * det * det)), half_flat_ = float(1.5 * blur);
+        zgx_ = float(xx * p[kGx] + xy * p[kGy]);
+        zgy_ = float(xy * p[kGx] + yy * p[kGy]);
+        turn_ = float((yy * yy - xx * xx) * kRootHalf);
+        shear_ = float(xy * (xx + yy) * kRootHalf);
+        per_blur_ = float(1 / blur);
+        peak_ = float(-kPeak / blur);
+        half_bend_ = float(blur / (2 * det * det));
+        half_flat_ = float(1.5 * blur);
         if constexpr (kAlone) {
             outside_ = float(p[kSidesOf[edge].outside]);
             jump_ = float(p[kSidesOf[edge].inside] - p[kSidesOf[edge].outside]);
@@ -123,7 +135,8 @@ class ModelOf {
 
   private:
     static constexpr bool kAlone = edge != kAnyEdge;
-    static constexpr double kRootHalf = 0.70710678, kPeak = 0.39894228;  // sqrt(1/2), 1 / sqrt(2 pi)
+    static constexpr double kRootHalf = 0.70710678;  // sqrt(1/2)
+    static constexpr double kPeak = 0.39894228;      // 1 / sqrt(2 pi)
 
     /// The geometry of pixels: q = A^-1 (x - c), f = |X|, n the direction of grad f, distance over f, the
     /// shift of an edge of radius 1 by blur, and the derivative of the distance by g . q.
@@ -141,7 +154,10 @@ class ModelOf {
         const Lanes depth = kAlone ? all(1) : 1.0f - gx_ * qx - gy_ * qy;
         const Lanes f = kAlone ? qq * per_q : qq * per_q / depth;
         Lanes mx = qx * per_q, my = qy * per_q;  // grad f = A^-1 m / depth
-        if constexpr (!kAlone) mx += f * gx_, my += f * gy_;
+        if constexpr (!kAlone) {
+            mx += f * gx_;
+            my += f * gy_;
+        }
         // The derivative by a shape is taken at the nearest point of the edge, |q| = 1.
         at.qx[k] = kAlone ? mx : qx, at.qy[k] = kAlone ? my : qy;
         at.f[k] = f, at.stretch[k] = depth, at.bow[k] = per_q;
@@ -191,7 +207,9 @@ class ModelOf {
         const Lanes by = ring + by_card;  // the level by the distance outwards
         const Lanes dark = outer.inside[k] - inner.inside[k], ground = 1.0f - card.inside[k];
         const Lanes tip = by * at.tip[k];
-        to.by[kDark][k] = dark, to.by[kGround][k] = ground, to.by[kBright][k] = 1.0f - dark - ground;
+        to.by[kDark][k] = dark;
+        to.by[kGround][k] = ground;
+        to.by[kBright][k] = 1.0f - dark - ground;
         to.by[kBlur][k] = fall_ * (outer.by_blur[k] - inner.by_blur[k]) - drop_ * card.by_blur[k];
         to.by[kRatio][k] = -by_inner * at.stretch[k], to.by[kCard][k] = -by_card * at.stretch[k];
         differentiate_shape(at, by, k, to);
@@ -204,7 +222,8 @@ class ModelOf {
     ROUNDEL_INLINE Lanes differentiate(const Geometry& at, const Profile& profile, int k,
                                        Gradient& to) const {
         const Lanes by = jump_ * profile.slope[k], inside = profile.inside[k];
-        to.by[kSidesOf[edge].inside][k] = inside, to.by[kSidesOf[edge].outside][k] = 1.0f - inside;
+        to.by[kSidesOf[edge].inside][k] = inside;
+        to.by[kSidesOf[edge].outside][k] = 1.0f - inside;
         to.by[kBlur][k] = jump_ * profile.by_blur[k];
         differentiate_shape(at, by, k, to);
         to.ring[k] = edge == kCardEdge ? all(0) : by;
@@ -213,8 +232,11 @@ class ModelOf {
 
     ROUNDEL_INLINE static void differentiate_shape(const Geometry& at, const Lanes& by, int k, Gradient& to) {
         const Lanes by_x = -by * at.nx[k], by_y = -by * at.ny[k], qx = at.qx[k], qy = at.qy[k];
-        to.by[kX][k] = by_x, to.by[kY][k] = by_y;
-        to.by[kAxx][k] = by_x * qx, to.by[kAxy][k] = by_x * qy + by_y * qx, to.by[kAyy][k] = by_y * qy;
+        to.by[kX][k] = by_x;
+        to.by[kY][k] = by_y;
+        to.by[kAxx][k] = by_x * qx;
+        to.by[kAxy][k] = by_x * qy + by_y * qx;
+        to.by[kAyy][k] = by_y * qy;
     }
 
     ROUNDEL_INLINE static Lanes compare(const Lanes& seen, const Lanes& level) {
@@ -223,7 +245,8 @@ class ModelOf {
 
     float x_, y_, gx_, gy_, inverse_xx_, inverse_xy_, inverse_yy_, ratio_, card_;
     float bright_, fall_, drop_, per_blur_, peak_, half_bend_, half_flat_, zgx_, zgy_, turn_, shear_;
-    float outside_ = 0, jump_ = 0;  // for a single edge
+    float outside_ = 0;  // for a single edge
+    float jump_ = 0;     // for a single edge
 };
 
 using Model = ModelOf<kAnyEdge>;

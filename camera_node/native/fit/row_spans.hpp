@@ -31,9 +31,13 @@ struct RowEllipse {
         // (S^(1/2) + more)^2, where S^(1/2) = (S + a b) / (a + b)
         const double scale = 1 + 2 * more / sum, yy = scale * e.shape.yy + more * (2 * ab / sum + more);
         const double height = std::sqrt(yy);
-        x = float(e.x), y = float(e.y), per_height = float(1 / height);
-        width = float(product / height), lean = float(scale * e.shape.xy / yy);
-        top = e.y - height, bottom = e.y + height;
+        x = float(e.x);
+        y = float(e.y);
+        per_height = float(1 / height);
+        width = float(product / height);
+        lean = float(scale * e.shape.xy / yy);
+        top = e.y - height;
+        bottom = e.y + height;
     }
 };
 
@@ -47,8 +51,11 @@ struct Spans {
 struct RowEllipses {
     Lanes x, y, per_height = all(1e6f), width, lean;
     void set(int k, const RowEllipse& e) {
-        x[k] = e.x, y[k] = e.y, per_height[k] = e.per_height;
-        width[k] = e.width, lean[k] = e.lean;
+        x[k] = e.x;
+        y[k] = e.y;
+        per_height[k] = e.per_height;
+        width[k] = e.width;
+        lean[k] = e.lean;
     }
     static RowEllipses all_of(const RowEllipse& o) {
         return {all(o.x), all(o.y), all(o.per_height), all(o.width), all(o.lean)};

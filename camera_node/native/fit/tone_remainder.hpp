@@ -18,7 +18,8 @@ class ToneRemainder {
     /// The curvature k between two levels: the share s of the light appears as about the share s + k s (1 -
     /// s) of their difference. It is exact at s = 1/2.
     double curvature(double dark, double bright) const {
-        dark = std::clamp(dark, 0.0, 255.0), bright = std::clamp(bright, 0.0, 255.0);
+        dark = std::clamp(dark, 0.0, 255.0);
+        bright = std::clamp(bright, 0.0, 255.0);
         if (!any_ || bright <= dark) return 0;
         const double half = (light_at(dark) + light_at(bright)) / 2;
         const auto above = std::upper_bound(light_.begin() + 1, light_.end() - 1, half);

@@ -39,8 +39,11 @@ void set_ellipse(const Dual& D, double z, const Dual& change, Vector<DiscView::k
     Dual d;
     for (size_t i = 0; i < d.size(); ++i) d[i] = (change[i] - D[i] * change[5]) / z;
     const double x = D[3], y = D[4];
-    to[0] = d[3], to[1] = d[4];
-    to[2] = 2 * x * d[3] - d[0], to[3] = x * d[4] + y * d[3] - d[1], to[4] = 2 * y * d[4] - d[2];
+    to[0] = d[3];
+    to[1] = d[4];
+    to[2] = 2 * x * d[3] - d[0];
+    to[3] = x * d[4] + y * d[3] - d[1];
+    to[4] = 2 * y * d[4] - d[2];
 }
 
 }  // namespace

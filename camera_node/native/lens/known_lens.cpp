@@ -49,13 +49,17 @@ Symmetric shape_derivative(const LinearMap& J, const Symmetric& A, const Symmetr
 Matrix7 derivative_of(const LinearMap& J, const Symmetric& A) {
     Matrix7 T{};
     for (const auto& [row, column] : {std::pair(0, 0), std::pair(5, 0), std::pair(5, 5)}) {
-        T[row][column] = J.xx, T[row][column + 1] = J.xy;
-        T[row + 1][column] = J.yx, T[row + 1][column + 1] = J.yy;
+        T[row][column] = J.xx;
+        T[row][column + 1] = J.xy;
+        T[row + 1][column] = J.yx;
+        T[row + 1][column + 1] = J.yy;
     }
     constexpr Symmetric kUnit[] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
     for (int k = 0; k < 3; ++k) {
         const Symmetric dS = shape_derivative(J, A, kUnit[k]);
-        T[2][2 + k] = dS.xx, T[3][2 + k] = dS.xy, T[4][2 + k] = dS.yy;
+        T[2][2 + k] = dS.xx;
+        T[3][2 + k] = dS.xy;
+        T[4][2 + k] = dS.yy;
     }
     return T;
 }
@@ -98,8 +102,10 @@ class PoseEstimator {
             if (!factor.positive()) return std::nullopt;
             Step step = factor.solve(gradient);
             double moved = 0, most = 0;
-            for (int i = 0; i < kUnknowns; ++i)
-                moved += step[i] * gradient[i], most = std::max(most, std::abs(step[i]));
+            for (int i = 0; i < kUnknowns; ++i) {
+                moved += step[i] * gradient[i];
+                most = std::max(most, std::abs(step[i]));
+            }
             for (double& value : step) value *= std::min(1.0, kMaxStep / most);
             disc.move(step);
             if (!disc.is_visible()) return std::nullopt;
@@ -222,7 +228,8 @@ ConstrainedEllipse constrain_to_lens(const DiscMeasurement& measured, const Lens
     for (auto& row : whitened) row = factor.halfway(row);
     const Change change =
         mean_of({condition(*one, whitened, Sigma), condition(*other, whitened, Sigma)}, {p, 1 - p});
-    result.outer = moved(measured.outer, change.by), result.covariance = change.covariance;
+    result.outer = moved(measured.outer, change.by);
+    result.covariance = change.covariance;
     return result;
 }
 

@@ -51,7 +51,8 @@ std::optional<Point> Lens::normalise(Point pixel) const {
         // A lens whose distortion folds the picture has a determinant of 0 at the fold.
         if (!(J.det() > 0) || !(std::hypot(xy.x, xy.y) < kMaxTangent)) return std::nullopt;
         const Point step = J.inverse() * off;
-        xy.x += step.x, xy.y += step.y;
+        xy.x += step.x;
+        xy.y += step.y;
     }
     return std::nullopt;
 }
@@ -61,7 +62,8 @@ std::optional<Point> Lens::normalise_near(Point pixel, Point xy, const LinearMap
         const Point at = project(xy), off{pixel.x - at.x, pixel.y - at.y};
         if (std::hypot(off.x, off.y) < kExact) return xy;
         const Point step = inverse * off;
-        xy.x += step.x, xy.y += step.y;
+        xy.x += step.x;
+        xy.y += step.y;
     }
     return std::nullopt;
 }

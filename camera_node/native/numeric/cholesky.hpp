@@ -55,7 +55,8 @@ class Cholesky {
     template <int M>
     std::array<Vector<M>, M> inverse_tail() const {
         constexpr int first = N - M;
-        std::array<Vector<M>, M> K{}, inverse{};  // K = L_22^-1
+        std::array<Vector<M>, M> K{};  // L_22^-1
+        std::array<Vector<M>, M> inverse{};
         for (int j = 0; j < M; ++j) {
             K[j][j] = per_diagonal_[first + j];
             for (int i = j + 1; i < M; ++i) {

@@ -14,7 +14,8 @@ constexpr int kRays = 16;
 
 struct Direction {
     float x, y;
-    float per_x, per_y;  // 1 over their amounts, at most 1e6
+    float per_x;  // 1 / abs(x), at most 1e6
+    float per_y;  // 1 / abs(y), at most 1e6
 };
 
 inline const std::array<Direction, kRays> kDirections = [] {
@@ -54,9 +55,18 @@ class Ray {
         const int last = int(std::min(limit, end_));
         int t = t_, u = u_ + t * du_, v = v_ + t * dv_;  // in 1/65536 of a pixel
         const auto is_there = [&] { return (image_.row(v >> 16)[u >> 16] < theta) == dark; };
-        while (t < last && is_there()) ++t, u += du_, v += dv_;
-        while (t < last && !is_there()) ++t, u += du_, v += dv_;
-        return t_ = t, t < last ? t : -1;
+        while (t < last && is_there()) {
+            ++t;
+            u += du_;
+            v += dv_;
+        }
+        while (t < last && !is_there()) {
+            ++t;
+            u += du_;
+            v += dv_;
+        }
+        t_ = t;
+        return t < last ? t : -1;
     }
     /// The position at which the level is theta, near the pixel that a walk found.
     float between(int pixel, float theta) const {
@@ -64,7 +74,8 @@ class Ray {
         for (int k = 0; k < 3; ++k) {
             const float after = level(t + 1);
             if ((before < theta) != (after < theta)) return t + (theta - before) / (after - before);
-            before = after, t += 1;
+            before = after;
+            t += 1;
         }
         return float(pixel) - 0.5f;
     }

@@ -16,8 +16,9 @@ namespace {
 
 /// A dark segment with a bright one inside that passes the tests of Section III-B.
 struct SegmentPair {
-    int dark, bright;  // numbers of the segments
-    Moments disc;      // of both together: the outer disc
+    int dark;      // number of the segment
+    int bright;    // number of the segment
+    Moments disc;  // of both together: the outer disc
 };
 
 Symmetric covariance(const Moments& m) {
@@ -104,7 +105,8 @@ std::optional<InitialGuess> rethreshold(const ImageView& image, const Segment& o
     const Segments segments = grow_segments(window, constant_threshold(uint8_t(std::lround(theta))));
     for (const SegmentPair& pair : find_pairs(segments, width, height, limits)) {
         Ellipse e = covariance_ellipse(pair.disc);
-        e.x += left, e.y += top;
+        e.x += left;
+        e.y += top;
         if (e.x < outer.left || e.x > outer.right || e.y < outer.top || e.y > outer.bottom) continue;
         const double ratio = std::sqrt(segments.list[size_t(pair.bright)].moments.n / pair.disc.n);
         return InitialGuess{e, ratio, mean_level(window, segments, pair.dark),

@@ -7,8 +7,12 @@
 namespace roundel {
 
 Moments& Moments::operator+=(const Moments& other) {
-    n += other.n, x += other.x, y += other.y;
-    xx += other.xx, xy += other.xy, yy += other.yy;
+    n += other.n;
+    x += other.x;
+    y += other.y;
+    xx += other.xx;
+    xy += other.xy;
+    yy += other.yy;
     return *this;
 }
 
@@ -48,7 +52,8 @@ int find_root(std::vector<SegmentRun>& runs, int k) {
 }
 
 void join(std::vector<SegmentRun>& runs, int a, int b) {
-    a = find_root(runs, a), b = find_root(runs, b);
+    a = find_root(runs, a);
+    b = find_root(runs, b);
     runs[size_t(std::max(a, b))].segment = std::min(a, b);
 }
 

@@ -95,8 +95,10 @@ struct BlockBits {
 struct RowBits {
     uint64_t *mean, *pairs;
     ROUNDEL_INLINE void put(int n, const BlockBits& bits) {
-        mean[2 * n] = bits.mean[0], mean[2 * n + 1] = bits.mean[1];
-        pairs[kWord * n] = bits.upper, pairs[kWord * n + 1] = bits.lower;
+        mean[2 * n] = bits.mean[0];
+        mean[2 * n + 1] = bits.mean[1];
+        pairs[kWord * n] = bits.upper;
+        pairs[kWord * n + 1] = bits.lower;
     }
 };
 
@@ -180,7 +182,8 @@ struct Tail {
 
 void binarize(const ImageView& image, const ThresholdMap& threshold, BitImage& rows, BitImage& columns) {
     const int w = image.width, h = image.height, whole = w / kBlock, blocks = (w + kBlock - 1) / kBlock;
-    rows.reset((h + 1) / 2, w), columns.reset((w + 1) / 2, h);
+    rows.reset((h + 1) / 2, w);
+    columns.reset((w + 1) / 2, h);
     RowThreshold theta(blocks * kBlock);
     std::vector<uint64_t> pairs(size_t(blocks) * kWord), mean(size_t(blocks) * 2);
     for (int y = 0; y < h; y += 2) {

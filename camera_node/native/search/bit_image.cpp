@@ -37,7 +37,8 @@ ROUNDEL_INLINE void exchange_within(Four& a, Four& b) {
     Four even = __builtin_shufflevector(upper, lower, 0, 4, 2, 6);
     Four odd = __builtin_shufflevector(upper, lower, 1, 5, 3, 7);
     exchange<1>(even, odd, 0x5555555555555555u);
-    a = __builtin_shufflevector(even, odd, 0, 4, 1, 5), b = __builtin_shufflevector(even, odd, 2, 6, 3, 7);
+    a = __builtin_shufflevector(even, odd, 0, 4, 1, 5);
+    b = __builtin_shufflevector(even, odd, 2, 6, 3, 7);
 }
 
 /// Transposes 64 x 64 bits in place by exchanging ever smaller quarters (Warren, Hacker's Delight, 7-3).
@@ -76,7 +77,9 @@ inline uint64_t bits_from(const uint64_t* line, int from) {
 }  // namespace
 
 void BitImage::reset(int line_count, int line_length) {
-    lines = line_count, length = line_length, words = (line_length + kWord - 1) / kWord;
+    lines = line_count;
+    length = line_length;
+    words = (line_length + kWord - 1) / kWord;
     const size_t needed = size_t(lines) * size_t(words);
     if (needed > room_) bits_ = std::make_unique_for_overwrite<uint64_t[]>(room_ = needed);
 }

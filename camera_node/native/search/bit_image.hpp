@@ -12,8 +12,9 @@ constexpr int kWord = 64;
 /// pixels.
 class BitImage {
   public:
-    int lines = 0, length = 0;  // of a line, pixels
-    int words = 0;              // of a line
+    int lines = 0;
+    int length = 0;  // of a line, pixels
+    int words = 0;   // of a line
     /// Allocates the image; its bits are undefined.
     void reset(int line_count, int line_length);
     const uint64_t* line(int k) const { return bits_.get() + size_t(k) * size_t(words); }

@@ -10,8 +10,9 @@ namespace roundel {
 
 namespace {
 
-constexpr int kTile = 8, kCell = 4;  // pixels of a tile's side; tiles of a cell's
-constexpr uint16_t kNever = 65535;   // differs much from any sum
+constexpr int kTile = 8;            // pixels of a tile's side
+constexpr int kCell = 4;            // tiles of a cell's side
+constexpr uint16_t kNever = 65535;  // differs much from any sum
 constexpr double kCard = 1.4,
                  kMargin = 12;  // outer diameters; pixels: width of a card, and of tiles around it
 
@@ -75,15 +76,20 @@ bool Box::meets(const Box& other) const {
 }
 
 void Box::join(const Box& other) {
-    left = std::min(left, other.left), top = std::min(top, other.top);
-    right = std::max(right, other.right), bottom = std::max(bottom, other.bottom);
+    left = std::min(left, other.left);
+    top = std::min(top, other.top);
+    right = std::max(right, other.right);
+    bottom = std::max(bottom, other.bottom);
 }
 
 void ChangeMask::update(const ImageView& image) {
     if (image.width != width_ || image.height != height_) {
-        width_ = image.width, height_ = image.height;
-        columns_ = in_units(width_, kTile), rows_ = in_units(height_, kTile);
-        now_.resize(size_t(columns_) * size_t(rows_)), searched_.resize(now_.size());
+        width_ = image.width;
+        height_ = image.height;
+        columns_ = in_units(width_, kTile);
+        rows_ = in_units(height_, kTile);
+        now_.resize(size_t(columns_) * size_t(rows_));
+        searched_.resize(now_.size());
         invalidate();
     }
     masked_.assign(now_.size(), 0);
@@ -154,11 +160,14 @@ std::vector<Box> ChangeMask::changed(double limit, double share) const {
                 ++n;
                 continue;
             }
-            box.join(boxes[n]), area -= boxes[n].area();
-            boxes[n] = boxes.back(), boxes.pop_back();
+            box.join(boxes[n]);
+            area -= boxes[n].area();
+            boxes[n] = boxes.back();
+            boxes.pop_back();
             n = 0;  // the larger box may meet boxes that it did not meet before
         }
-        boxes.push_back(box), area += box.area();
+        boxes.push_back(box);
+        area += box.area();
         if (area > share * frame.area()) return {frame};
     }
     return boxes;

@@ -41,8 +41,12 @@ class ChangeMask {
     void visit(const Ellipse& outer, const Work& work);
     std::vector<uint8_t> changed_cells(int limit) const;
 
-    int width_ = 0, height_ = 0, columns_ = 0, rows_ = 0;  // pixels; tiles
-    std::vector<uint16_t> now_, searched_;                 // sums of the tiles' column means
+    int width_ = 0;                   // pixels
+    int height_ = 0;                  // pixels
+    int columns_ = 0;                 // tiles
+    int rows_ = 0;                    // tiles
+    std::vector<uint16_t> now_;       // sums of the tiles' column means
+    std::vector<uint16_t> searched_;  // sums of the tiles' column means
     std::vector<uint8_t> masked_;
 };
 

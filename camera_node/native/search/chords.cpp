@@ -12,15 +12,16 @@ namespace roundel {
 
 namespace {
 
-constexpr int kSlack = 24;        // tolerance of a run, sixteenths of a pixel: edge and blur
-constexpr int kCoarseLeast = 6;   // least length on a diagonal, whose pixels are sqrt(8) wide, and
-constexpr int kCoarseSlack = 16;  // tolerance, sixteenths of them
-constexpr int kUneven = 26;       // longer dark run over the shorter one without occlusion, sixteenths
-constexpr int kDrift = 3;         // pixels that the middle may move from one line to the next
-constexpr int kStreakLines = 3, kStreakWidth = 14;  // least number of lines and least width, pixels
-constexpr float kStreakLength = 0.5f;               // least length over the width; less for oblique bars:
-constexpr float kOblique = 0.83f;  // width times the sine of the slant by which the length is shorter
-constexpr float kMaxSine = 0.45f;  // of the slant off a diagonal; rows or columns are better beyond
+constexpr int kSlack = 24;             // tolerance of a run, sixteenths of a pixel: edge and blur
+constexpr int kCoarseLeast = 6;        // least length on a diagonal, whose pixels are sqrt(8) wide, and
+constexpr int kCoarseSlack = 16;       // tolerance, sixteenths of them
+constexpr int kUneven = 26;            // longer dark run over the shorter one without occlusion, sixteenths
+constexpr int kDrift = 3;              // pixels that the middle may move from one line to the next
+constexpr int kStreakLines = 3;        // least number of lines
+constexpr int kStreakWidth = 14;       // least width, pixels
+constexpr float kStreakLength = 0.5f;  // least length over the width; less for oblique bars:
+constexpr float kOblique = 0.83f;      // width times the sine of the slant by which the length is shorter
+constexpr float kMaxSine = 0.45f;      // of the slant off a diagonal; rows or columns are better beyond
 
 constexpr int kBatch = 16;                        // lines scanned together
 constexpr int kPadding = 2 * kWord + 4 * kLanes;  // numbers that are read beyond the last one
@@ -67,7 +68,8 @@ struct DarkRuns {
     Bits begin, end;
     ROUNDEL_INLINE explicit DarkRuns(const int* edges) {
         Bits a, b;
-        __builtin_memcpy(&a, edges, sizeof a), __builtin_memcpy(&b, edges + kLanes, sizeof b);
+        __builtin_memcpy(&a, edges, sizeof a);
+        __builtin_memcpy(&b, edges + kLanes, sizeof b);
         begin = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14);
         end = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15);
     }
@@ -222,7 +224,8 @@ bool ChordSearch::is_unoccluded(int x, int y, int dx, int dy) const {
 /// not.
 void ChordSearch::test_across_diagonal(const Stack& stack) {
     const Raster& r = raster_;
-    const int dx = r.step_x > 0 ? 1 : -1, dy = -1;  // across the diagonal, upwards
+    const int dx = r.step_x > 0 ? 1 : -1;  // across the diagonal
+    const int dy = -1;                     // upwards
     const float at = float(stack.middle + stack.begin) / 2, line = float(stack.first + stack.last) / 2;
     const int x = int(r.x + at * r.step_x + line * r.line_x), y = int(r.y + at * r.step_y + line * r.line_y);
     if (!is_inside(x, y) || rows_.is_dark(y / 2, x)) return;
@@ -262,7 +265,10 @@ void ChordSearch::add_streak(const Stack& stack) {
 
 void ChordSearch::scan(const BitImage& along, const BitImage* across, const Raster& raster,
                        const Proportions& limits) {
-    across_ = across, along_rows_ = raster.step_y == 0, raster_ = raster, limits_ = limits;
+    across_ = across;
+    along_rows_ = raster.step_y == 0;
+    raster_ = raster;
+    limits_ = limits;
     const size_t most = size_t(kBatch) * size_t(along.length + 1) + kPadding;
     if (most > room_) {
         edges_ = std::make_unique_for_overwrite<int[]>(most);
@@ -289,7 +295,8 @@ void ChordSearch::scan_diagonals() {
 }
 
 void ChordSearch::run(const ImageView& image, const ThresholdMap& threshold) {
-    seeds_.clear(), streaks_.clear();
+    seeds_.clear();
+    streaks_.clear();
     image_ = &image;
     binarize(image, threshold, rows_, columns_);
     scan(rows_, &columns_, {0, 0.5f, 1, 0, 0, 2}, fine_);

@@ -11,17 +11,21 @@ namespace roundel {
 
 /// A point that may be the centre of a roundel.
 struct Seed {
-    float x, y;
-    float reach;       // largest distance of the hole's edge, pixels
-    int dark, bright;  // the paper's m_d and m_b, from a few pixels
+    float x;      // of the centre, pixels
+    float y;      // of the centre, pixels
+    float reach;  // largest distance of the hole's edge, pixels
+    int dark;     // the paper's m_d, from a few pixels
+    int bright;   // the paper's m_b, from a few pixels
 };
 
 /// Two parallel dark bars with a bright one between them: the image of a roundel that moves along them by the
 /// width of its hole or more during the exposure.
 struct Streak {
-    float x, y;              // the centre, pixels
-    float along_x, along_y;  // direction of the bars, a unit vector
-    float width;             // from one bar's outer side to the other's, pixels
+    float x;        // of the centre, pixels
+    float y;        // of the centre, pixels
+    float along_x;  // direction of the bars, a unit vector
+    float along_y;  // direction of the bars, a unit vector
+    float width;    // from one bar's outer side to the other's, pixels
 };
 
 /// Limits on a chord of a roundel: its least and greatest length in pixels, the greatest and least ratio of a
@@ -56,11 +60,13 @@ class ChordSearch {
   private:
     /// A bright run between two dark ones, and the runs on the lines before that it continues.
     struct Stack {
-        int middle, inner;  // of the last line: middle of the bright run, and its length, pixels
-        int first, last;    // lines, of two pixels each
-        int begin;          // middle on the first line
-        int outer;          // longest chord, with its dark runs
-        bool continued;     // by another stack
+        int middle;      // of the last line's bright run
+        int inner;       // length of the last line's bright run, pixels
+        int first;       // line, of two pixels
+        int last;        // line, of two pixels
+        int begin;       // middle on the first line
+        int outer;       // longest chord, with its dark runs
+        bool continued;  // by another stack
     };
     /// The position in the image of pixel k of line d: origin + k step + d line, as x and y.
     struct Raster {
@@ -79,7 +85,9 @@ class ChordSearch {
     void add_streak(const Stack& stack);
     bool is_diametral(int dark, int inner) const;
 
-    Proportions fine_{}, coarse_{}, limits_{};  // for rows and columns; for diagonals; for the current scan
+    Proportions fine_{};    // for rows and columns
+    Proportions coarse_{};  // for diagonals
+    Proportions limits_{};  // for the current scan
     Raster raster_{};
     int min_contrast_ = 0;  // grey levels
     BitImage rows_, columns_, sparse_, diagonals_;

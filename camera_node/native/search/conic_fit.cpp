@@ -80,7 +80,8 @@ struct ConicFrame {
     double x, y, outer, inner;
     explicit ConicFrame(const Conics& c) : x(c.middle_x()), y(c.middle_y()) {
         const double least = c.at(x, y);  // negative
-        outer = 1 - least, inner = c.level - least;
+        outer = 1 - least;
+        inner = c.level - least;
     }
     bool is_valid() const { return inner > 0 && inner < outer; }
 };
@@ -166,7 +167,8 @@ float ratio_spread(const Crossings& crossings, uint16_t rays) {
     float least = 1, most = 0;
     for (unsigned left = rays & crossings.seen[0] & crossings.seen[1]; left; left &= left - 1) {
         const float ratio = crossings.ratio_of[std::countr_zero(left)];
-        least = std::min(least, ratio), most = std::max(most, ratio);
+        least = std::min(least, ratio);
+        most = std::max(most, ratio);
     }
     return most - least;
 }
@@ -182,8 +184,10 @@ std::optional<Conics> fit_visible_part(const Crossings& crossings) {
         for (int k = 0; k < crossings.count; ++k) weights.at[k] = float(part >> crossings.ray[k] & 1);
         const auto conics = solve(crossings, weights);
         if (!conics || !ConicFrame(*conics).is_valid()) continue;
-        if (const int agree = reweigh(crossings, *conics, weights); agree > most)
-            most = agree, best = weights;
+        if (const int agree = reweigh(crossings, *conics, weights); agree > most) {
+            most = agree;
+            best = weights;
+        }
     }
     return best ? iterate(crossings, *best, kMinAgreeOccluded) : std::nullopt;
 }

@@ -24,8 +24,11 @@ struct Crossings {
     void add(int number, float at, bool is_inner, float its_ratio) {
         const Direction direction = kDirections[size_t(number)];
         const float away = at / float(unit);
-        x[count] = away * direction.x, y[count] = away * direction.y, inner[count] = is_inner;
-        ratio_of[number] = ratio[count] = its_ratio, ray[count++] = number;
+        x[count] = away * direction.x;
+        y[count] = away * direction.y;
+        inner[count] = is_inner;
+        ratio_of[number] = ratio[count] = its_ratio;
+        ray[count++] = number;
         seen[is_inner] |= uint16_t(1 << number);
     }
     int count_of(uint16_t rays) const {

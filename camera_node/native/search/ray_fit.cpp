@@ -47,7 +47,8 @@ Crossings cast(const ImageView& image, const Seed& seed, const RatioRange& ratio
         const int inner = ray.walk<true>(below, seed.reach);
         int outer = inner < 0 ? -1 : ray.walk<false>(below, (float(inner) - 0.5f) / float(ratios.least) + 2);
         if (inner >= ratios.most * outer + 1) outer = -1;
-        missed += outer < 0, crossed += (inner >= 0) + (outer >= 0);
+        missed += outer < 0;
+        crossed += (inner >= 0) + (outer >= 0);
         walks[size_t(n)] = {kOrder[size_t(n)], inner, outer};
     }
     if (crossed < kMinCrossings) return crossings;
@@ -75,7 +76,8 @@ std::optional<InitialGuess> cast_and_fit(const ImageView& image, const Seed& see
     if (!circles) return std::nullopt;
     auto [outer, ratio] = *circles;
     if (!(std::hypot(outer.x, outer.y) < outer.major)) return std::nullopt;
-    outer.x += double(seed.x), outer.y += double(seed.y);
+    outer.x += double(seed.x);
+    outer.y += double(seed.y);
     const EllipseLevels on(outer);
     return InitialGuess{outer, ratio, median_level(image, on, (1 + ratio) / 2),
                         median_level(image, on, ratio / 3)};

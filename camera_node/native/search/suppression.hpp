@@ -21,7 +21,8 @@ class Suppression {
 
   private:
     size_t tile(double x, double y) const;
-    int columns_, rows_;           // of tiles of 8 x 8 pixels
+    int columns_;                  // of tiles of 8 x 8 pixels
+    int rows_;                     // of tiles of 8 x 8 pixels
     std::vector<uint16_t> tiles_;  // 1 + the number of the last ellipse that reaches the tile, or 0
     std::vector<Ellipse> ellipses_;
 };

@@ -30,8 +30,11 @@ int span_of(const ImageView& patch) {
 }  // namespace
 
 double noise_level(const ImageView& image) {
-    constexpr int kPatches = 16, kWidth = 8, kHeight = 4;  // patches in either direction; pixels
-    constexpr double kFlat = 0.05, kDeviations = 2.9;      // the range of the flattest twentieth, in sigmas
+    constexpr int kPatches = 16;         // in either direction
+    constexpr int kWidth = 8;            // of a patch, pixels
+    constexpr int kHeight = 4;           // of a patch, pixels
+    constexpr double kFlat = 0.05;       // share of the patches that are the flattest
+    constexpr double kDeviations = 2.9;  // range of a flat patch, standard deviations
     if (image.width < kWidth || image.height < kHeight) return 1;
     std::array<int, kPatches * kPatches> spans;
     for (int k = 0; k < kPatches * kPatches; ++k) {
@@ -106,8 +109,10 @@ inline void join_neighbours(const uint8_t* low, const uint8_t* high, int n, uint
 struct ColumnExtremes {
     std::vector<uint8_t> low[3], high[3];
     explicit ColumnExtremes(int tiles) {
-        for (int k = 0; k < 3; ++k)
-            low[k].assign(size_t(tiles) * size_t(kTile >> k), 255), high[k].assign(low[k].size(), 0);
+        for (int k = 0; k < 3; ++k) {
+            low[k].assign(size_t(tiles) * size_t(kTile >> k), 255);
+            high[k].assign(low[k].size(), 0);
+        }
     }
 };
 

@@ -32,9 +32,9 @@ constexpr double kProcessing = 0.5;        // share of a misfit that may be comm
 constexpr double kMaxProcessing = 0.1;     // of the contrast: residuals that processing may make
 constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped paper may be displaced
 // A ring of fewer pixels than this shows the product of its width and its contrast, whose factors hardly
-// differ from those of a thinner and darker ring: its ink must be black, below this share of the paper's
-// level.
-constexpr double kThinRing = 3.6, kBlackInk = 0.7;
+// differ from those of a thinner and darker ring: its ink must be black.
+constexpr double kThinRing = 3.6;
+constexpr double kBlackInk = 0.7;  // share of the paper's level below which ink is black
 // Sectors of 32 with residuals of so much contrast, from which a part of a refused ring counts as covered.
 constexpr double kHidden = 0.3;
 constexpr int kMinHidden = 3;
@@ -139,8 +139,11 @@ bool is_same_ring(const RoundelFit& fit, const RoundelFit& tested) {
 
 /// The fit with what the tests of another one found. That one knows where the card ends.
 RoundelFit as_tested(RoundelFit fit, const RoundelFit& tested) {
-    fit.p[kCard] = tested.p[kCard], fit.p[kGround] = tested.p[kGround];
-    fit.unoccluded = tested.unoccluded, fit.correlation = tested.correlation, fit.uneven = tested.uneven;
+    fit.p[kCard] = tested.p[kCard];
+    fit.p[kGround] = tested.p[kGround];
+    fit.unoccluded = tested.unoccluded;
+    fit.correlation = tested.correlation;
+    fit.uneven = tested.uneven;
     return fit;
 }
 
@@ -170,7 +173,10 @@ TestedFit test(const ImageView& image, const RoundelFit& fit, const AcceptanceCo
 /// occlusion does, but smoothly.
 std::optional<TestedFit> fit_uneven(const ImageView& image, InitialGuess guess, const RoundelFit& fit,
                                     double ground, const AcceptanceContext& context) {
-    guess.outer = fit.outer, guess.model = fit.p, guess.noise = fit.noise, guess.fields = AllowedFields::kAll;
+    guess.outer = fit.outer;
+    guess.model = fit.p;
+    guess.noise = fit.noise;
+    guess.fields = AllowedFields::kAll;
     guess.ground = ground;
     const auto even = fit_photometric(image, guess);
     if (!even) return std::nullopt;
@@ -221,8 +227,10 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
 
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known) {
-    guess.prints = context.limits.prints, guess.light = context.light.at(guess.outer.x, guess.outer.y);
-    guess.curvature_sigma = context.curvature_sigma, guess.tone = context.tone;
+    guess.prints = context.limits.prints;
+    guess.light = context.light.at(guess.outer.x, guess.outer.y);
+    guess.curvature_sigma = context.curvature_sigma;
+    guess.tone = context.tone;
     guess.fields = AllowedFields::kBend;
     const auto fits = fit_on_ground(image, guess);
     if (!fits) return std::nullopt;

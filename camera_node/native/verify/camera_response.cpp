@@ -10,16 +10,17 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMinDiameter = 12;               // pixels: ratio and blur of smaller roundels are correlated
-constexpr double kDarkest = 2, kBrightest = 250;  // levels that are certainly not clipped
-constexpr double kMaxLogExponent = 0.9;           // 2.5: steeper ones enlarge what compression leaves
-constexpr int kHalvings = 16;                     // of the interval of exponents
-// A print that is only assumed or estimated: smaller roundels and more negative curvatures may be those of
-// another print.
-constexpr double kMaxByCurvature = 0.06, kMinAssumed = -0.3;
-constexpr double kSecondOrder = 0.15;  // error of a measured curvature, over its square
-constexpr double kMinTone = 0.1;       // logarithm of an exponent: smaller ones count as linear
-constexpr double kMaxLinear = 0.1;     // logarithm, up to which a measurement is exact to a hundredth
+constexpr double kMinDiameter = 12;      // pixels: ratio and blur of smaller roundels are correlated
+constexpr double kDarkest = 2;           // of the levels that are certainly not clipped
+constexpr double kBrightest = 250;       // of the levels that are certainly not clipped
+constexpr double kMaxLogExponent = 0.9;  // 2.5: steeper ones enlarge what compression leaves
+constexpr int kHalvings = 16;            // of the interval of exponents
+// A print that is only assumed or estimated:
+constexpr double kMaxByCurvature = 0.06;  // smaller roundels may be those of another print
+constexpr double kMinAssumed = -0.3;      // more negative curvatures may be those of another print
+constexpr double kSecondOrder = 0.15;     // error of a measured curvature, over its square
+constexpr double kMinTone = 0.1;          // logarithm of an exponent: smaller ones count as linear
+constexpr double kMaxLinear = 0.1;        // logarithm, up to which a measurement is exact to a hundredth
 constexpr double kMinLeft = 0.15;    // of a curvature: less is the error of the print, or learned as a spread
 constexpr double kMinChange = 0.02;  // of the logarithm
 constexpr double kMaxSigma = 0.15;   // of the logarithm, from which it is used
@@ -169,7 +170,8 @@ bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
                              return a.sigma < b.sigma;
                          })->sigma;
     const double gain = sigma_ == 0 ? 1 : kMemory;
-    mean_ += gain * (middle - mean_), sigma_ += gain * (sigma - sigma_);
+    mean_ += gain * (middle - mean_);
+    sigma_ += gain * (sigma - sigma_);
     const double change = std::abs(mean_ - log_exponent_);
     const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_) : kMinChange;
     knows_tone_ |= sigma_ <= kMaxSigma;

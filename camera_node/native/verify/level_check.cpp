@@ -21,7 +21,8 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
             const auto [x, y] = on.point(k, scale);
             const double level = fit.fields.even_level(double(x), double(y), double(levels[k]));
             const double share = (level - fit.dark) / contrast;  // 0 is ink, 1 is paper
-            ++samples.total, samples.wrong += std::abs(share - (dark ? 0 : 1)) > 0.3;
+            ++samples.total;
+            samples.wrong += std::abs(share - (dark ? 0 : 1)) > 0.3;
         }
     };
     for (const double share : {0.25, 0.5, 0.75})
@@ -50,7 +51,8 @@ bool is_bullseye(const ImageView& image, const RoundelFit& fit, double depth) {
         const double u = double(kDirections[size_t(k)].x), v = double(kDirections[size_t(k)].y);
         const double along = u * c + v * s, across = v * c - u * s;
         const float share = edge * float(std::hypot(2 * along / e.major, 2 * across / e.minor));
-        least = std::min(least, share), most = std::max(most, share);
+        least = std::min(least, share);
+        most = std::max(most, share);
         if (most >= kMaxSpread * least) return false;
     }
     return true;

@@ -59,7 +59,9 @@ void LightFalloff::set_size(const ImageView& image) {
     const double x = (image.width - 1) / 2.0, y = (image.height - 1) / 2.0;
     if (x == x_ && y == y_) return;
     *this = {};
-    x_ = x, y_ = y, per_radius_ = 1 / std::hypot(x, y);
+    x_ = x;
+    y_ = y;
+    per_radius_ = 1 / std::hypot(x, y);
 }
 
 LightGradient LightFalloff::at(double x, double y) const {
@@ -104,13 +106,15 @@ void LightFalloff::learn(const std::vector<const RoundelFit*>& fits, const Image
         const auto [x, y] = expected(fit.outer.x, fit.outer.y);
         return square(fit.shading.x - x) + square(fit.shading.y - y);
     });
-    rest_ += gain * (rest - rest_), knows_ = true;
+    rest_ += gain * (rest - rest_);
+    knows_ = true;
 }
 
 void LightFalloff::scale(double factor) {
     for (double& value : right_) value *= factor;
     for (double& value : mean_) value *= factor;
-    all_ *= square(factor), rest_ *= square(factor);
+    all_ *= square(factor);
+    rest_ *= square(factor);
 }
 
 /// Adds a measurement to the normal equations.
@@ -142,7 +146,8 @@ void LightFalloff::solve() {
             information[i][i] += 1 / (square(kSlopePrior) * std::max(all_, slope));
         const Cholesky<kCoefficients> factor(information);
         if (!factor.positive()) return;
-        mean_ = factor.solve(right_), cov_ = factor.inverse_tail<kCoefficients>();
+        mean_ = factor.solve(right_);
+        cov_ = factor.inverse_tail<kCoefficients>();
     }
 }
 

@@ -34,12 +34,15 @@ class LightFalloff {
     void include(const RoundelFit& fit);
     void solve();
 
-    double x_ = 0, y_ = 0, per_radius_ = 0;       // middle of the picture, and one over its half diagonal
+    double x_ = 0;                                // middle of the picture
+    double y_ = 0;                                // middle of the picture
+    double per_radius_ = 0;                       // one over half the picture's diagonal
     std::array<Row, kCoefficients> information_;  // of the measurements, lower triangle,
     Row right_;                                   // and their right hand side
     Row mean_{};                                  // of the coefficients
     std::array<Row, kCoefficients> cov_{};
-    double all_, rest_;  // variances of the gradient and of its rest, for each component
+    double all_;   // variance of the gradient, for each component
+    double rest_;  // variance of the gradient's rest, for each component
     bool knows_ = false;
 };
 

@@ -17,26 +17,32 @@ namespace {
 constexpr double kNoiseMisfit = 0.01;  // of a roundel without occlusion
 constexpr double kRestMisfit = 0.02;   // of the visible part of an occluded one
 constexpr double kOcclusion = 0.06;    // of sectors that show an occlusion although the fit passes the tests
-constexpr double kSlacks[] = {0.48, 0.12,
-                              0.03};  // of masked sectors, in turn: a biased fit spreads its misfit
+// Of masked sectors, in turn: a biased fit spreads its misfit.
+constexpr double kSlacks[] = {0.48, 0.12, 0.03};
 
-constexpr int kMaxMasked = 26, kMaxMaskedOfBoth = 44;  // sectors of 32, of one edge and of both
+constexpr int kMaxMasked = 26;            // sectors of 32, of one edge
+constexpr int kMaxMaskedOfBoth = 44;      // sectors of 64, of both edges
 constexpr double kMaxRatioError = 0.01;   // from the nearest print, beside its uncertainty: shows a bias
 constexpr double kMaxRatioSigma = 0.005;  // of that uncertainty
-constexpr double kMinKnown = 12, kMinNew = 16;  // pixels: smaller ones contain too little information
+constexpr double kMinKnown = 12;          // pixels: smaller ones contain too little information
+constexpr double kMinNew = 16;            // pixels: the same for new ones
 
 // Levels in units of the contrast, from ink (0) to paper (1):
-constexpr double kForeign = 0.05, kForeignSigmas = 3.5;  // difference of a level that is neither of them
-constexpr double kThinInk = 0.12;                        // of a thin stroke
-constexpr double kBright = 0.3;                          // of a place in the ring without ink, allowed
-constexpr int kMaxBright = 2;                            // in so many unmasked sectors
-constexpr double kNotPaper = 0.3;                        // difference from paper
+constexpr double kForeign = 0.05;       // difference of a level that is neither of them
+constexpr double kForeignSigmas = 3.5;  // the same in standard deviations
+constexpr double kThinInk = 0.12;       // of a thin stroke
+constexpr double kBright = 0.3;         // of a place in the ring without ink, allowed
+constexpr int kMaxBright = 2;           // in so many unmasked sectors
+constexpr double kNotPaper = 0.3;       // difference from paper
 
 constexpr double kRim = 1.06;  // outer radii: ink there continues the ring
 constexpr int kBlurred = 4;    // sectors of a run that the blurred edge of an occluding object can mask
-constexpr double kFirstRadius = 1.08, kStep = 0.03;  // outer radii at which paper is searched
-constexpr int kSteps = 13, kFirst = 3;               // up to 1.44; the end of a round card is found beyond
-constexpr int kBlurredSteps = 5, kMinSectors = 12;   // kFirst, within so many steps in so many sectors
+constexpr double kFirstRadius = 1.08;  // least of the outer radii at which paper is searched
+constexpr double kStep = 0.03;         // from one of them to the next
+constexpr int kSteps = 13;             // up to 1.44
+constexpr int kFirst = 3;              // the end of a round card is found beyond
+constexpr int kBlurredSteps = 5;       // a blurred end lies within so many steps of kFirst
+constexpr int kMinSectors = 12;        // in so many sectors
 
 /// The surroundings of a fitted roundel by sector and radius, in levels from ink (0) to paper (1).
 class SectorView {
@@ -82,7 +88,8 @@ bool has_round_card(const SectorView& view) {
         const Sectors beyond = paper & view.find(kFirstRadius + k * kStep, [](double level) {
             return std::abs(level - 1) > kNotPaper;
         });
-        ends[size_t(k)] = count_sectors(beyond), paper &= ~beyond;
+        ends[size_t(k)] = count_sectors(beyond);
+        paper &= ~beyond;
     }
     for (auto from = ends.begin() + kFirst; from + kBlurredSteps <= ends.end(); ++from)
         if (std::accumulate(from, from + kBlurredSteps, 0) >= kMinSectors) return true;
@@ -160,7 +167,8 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
                  .curvature_sigma = guess.curvature_sigma};
         const auto rest = fit_photometric(image, guess);
         if (!rest) return std::nullopt;
-        fit = *rest, misfit.reset();
+        fit = *rest;
+        misfit.reset();
     }
     if (!fit.is_explained(input.noise, kRestMisfit)) return std::nullopt;
     fit.correlation = EdgeMisfit(image, fit.p, fit.fields).correlation(fit.noise, guess.occlusion);

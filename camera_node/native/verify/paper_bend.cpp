@@ -14,15 +14,16 @@ namespace {
 // The picture shows a tilt against the image plane. Against the line of sight, it may differ by this
 // (tangent; 15 degrees off the optical axis).
 constexpr double kUnknownTilt = 0.15;
-// Squared bends over the tangent of the tilt: of paper bent by 0.25 % of its width, from which roundels count
-// alike, and by 5 %, which no print has.
-constexpr double kSmallBend = 1e-6, kMostBend = 4e-4;
-constexpr double kMostScore = 20;  // of a roundel's displacements that no bend makes
-constexpr double kChance = 2;      // standard deviations of a mean that noise explains
-constexpr double kMemory = 0.9;    // of a frame in the next one
-// Squared displacements over the squared length of the bend that shows: that of the mean
-// curvature, along the tilt; deviations from a cylinder; and one of the two components that show.
-constexpr double kMeanBend = 4, kOtherBend = 0.09, kComponent = 0.5;
+// Squared bends over the tangent of the tilt:
+constexpr double kSmallBend = 1e-6;  // of paper bent by 0.25 % of its width, from which roundels count alike
+constexpr double kMostBend = 4e-4;   // by 5 %, which no print has
+constexpr double kMostScore = 20;    // of a roundel's displacements that no bend makes
+constexpr double kChance = 2;        // standard deviations of a mean that noise explains
+constexpr double kMemory = 0.9;      // of a frame in the next one
+// Squared displacements over the squared length of the bend that shows:
+constexpr double kMeanBend = 4;      // that of the mean curvature, along the tilt
+constexpr double kOtherBend = 0.09;  // deviations from a cylinder
+constexpr double kComponent = 0.5;   // one of the two components that show
 
 double squared_tilt(const FieldFrame& frame) { return square(frame.tilt()) + square(kUnknownTilt); }
 
@@ -42,7 +43,10 @@ void PaperBend::learn_processing(const std::vector<const RoundelFit*>& fits) {
     double sum = 0;
     int count = 0;
     for (const RoundelFit* fit : fits)
-        if (fit->bend.variance > 0) sum += std::min(fit->bend.processing, kMostScore), ++count;
+        if (fit->bend.variance > 0) {
+            sum += std::min(fit->bend.processing, kMostScore);
+            ++count;
+        }
     if (!count) return;
     measured_.weight = kMemory * measured_.weight + count;
     measured_.excess = kMemory * measured_.excess + sum;
@@ -57,7 +61,8 @@ void PaperBend::learn(const std::vector<const RoundelFit*>& fits) {
         const double tilt = squared_tilt(FieldFrame(fit->p));
         const double noise = 2 * fit->bend.variance * processing_ / tilt;
         const double weight = 1 / square(noise + kSmallBend);
-        now.weight += weight, now.scatter += square(weight * noise);
+        now.weight += weight;
+        now.scatter += square(weight * noise);
         now.excess += weight * (std::min(fit->bend.squared / tilt, kMostBend) - noise);
     }
     if (!(now.weight > 0)) return;

@@ -64,8 +64,11 @@ PrintRatios::Kind PrintRatios::make_kind(double ratio) {
 void PrintRatios::include(Kind& kind, double ratio, double by_curvature, double sigma) {
     const double weight = 1 / square(sigma);
     Symmetric& A = kind.information;
-    A.xx += weight, A.xy += weight * by_curvature, A.yy += weight * square(by_curvature);
-    kind.by_print += weight * ratio, kind.by_curvature += weight * by_curvature * ratio;
+    A.xx += weight;
+    A.xy += weight * by_curvature;
+    A.yy += weight * square(by_curvature);
+    kind.by_print += weight * ratio;
+    kind.by_curvature += weight * by_curvature * ratio;
     if (++kind.count <= kMaxCount) return;
     kind.count /= 2;
     for (double* sum : {&A.xx, &A.xy, &A.yy, &kind.by_print, &kind.by_curvature}) *sum /= 2;
@@ -78,7 +81,10 @@ PrintRatios::Kind& PrintRatios::kind_of(double ratio, double by_curvature) {
     for (Kind& kind : kinds_) {
         const double expected =
             kind.count ? kind.print() + kind.curvature() * by_curvature : kind.first_ratio;
-        if (const double off = std::abs(expected - ratio); off < least) least = off, best = &kind;
+        if (const double off = std::abs(expected - ratio); off < least) {
+            least = off;
+            best = &kind;
+        }
     }
     if (best) return *best;
     if (kinds_.size() < kMaxKinds) return kinds_.emplace_back(make_kind(ratio));
@@ -177,7 +183,8 @@ std::vector<double> PrintRatios::recurring() const {
 void PrintRatios::forget_measurements() {
     for (Kind& kind : kinds_) {
         Kind empty = make_kind(kind.assigned ? kind.assigned->ratio : kind.first_ratio);
-        empty.recurs = kind.recurs, empty.assigned = kind.assigned;
+        empty.recurs = kind.recurs;
+        empty.assigned = kind.assigned;
         kind = empty;
     }
     used_.clear();

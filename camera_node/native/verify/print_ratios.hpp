@@ -43,9 +43,10 @@ class PrintRatios {
     /// A kind of roundels: the normal equations of its regression.
     struct Kind {
         Symmetric information;
-        double by_print, by_curvature;  // right hand side
-        double first_ratio;             // of its first roundel
-        int count = 0;                  // of measurements
+        double by_print;      // right hand side
+        double by_curvature;  // right hand side
+        double first_ratio;   // of its first roundel
+        int count = 0;        // of measurements
         bool recurs = false;
         std::optional<Print> assigned{};  // the print in use, after it recurs
         double print() const;

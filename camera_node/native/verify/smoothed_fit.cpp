@@ -39,10 +39,12 @@ std::optional<RoundelFit> fit_smoothed(const ImageView& image, const InitialGues
     if (width < 3 || height < 3) return std::nullopt;
     const std::vector<uint8_t> smooth = binomial_mean(image.window(left, top, width, height));
     InitialGuess moved = guess;
-    moved.outer.x -= left, moved.outer.y -= top;
+    moved.outer.x -= left;
+    moved.outer.y -= top;
     std::optional<RoundelFit> fit = fit_photometric({smooth.data(), width, height, width}, moved);
     if (!fit) return fit;
-    fit->outer.x += left, fit->outer.y += top;
+    fit->outer.x += left;
+    fit->outer.y += top;
     fit->pose_cov = scaled(fit->pose_cov, kInflation);
     return fit;
 }

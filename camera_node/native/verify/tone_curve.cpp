@@ -13,19 +13,22 @@ namespace {
 constexpr size_t kSamples = 64, kMinSamples = 6;
 constexpr double kDarkest = 1 / 255.0;
 constexpr int kSteps = 3;
-constexpr double kModelSigma = 0.05;                     // of a curvature: what the family leaves
-constexpr double kHuber = 1.5;                           // standard deviations
-constexpr double kExponent = 1.6, kExponentSigma = 0.8;  // priors
+constexpr double kModelSigma = 0.05;    // of a curvature: what the family leaves
+constexpr double kHuber = 1.5;          // standard deviations
+constexpr double kExponent = 1.6;       // mean of the prior
+constexpr double kExponentSigma = 0.8;  // standard deviation of the prior
 constexpr double kShoulderSigma = 4;
 constexpr double kLeastExponent = 0.3, kMostExponent = 5;
-constexpr double kLeastShoulder = -0.9, kMostShoulder = 15;  // the first over the exponent: light increases
-constexpr double kSignificant = 4;                           // standard deviations
+constexpr double kLeastShoulder = -0.9;  // over the exponent: light increases
+constexpr double kMostShoulder = 15;
+constexpr double kSignificant = 4;  // standard deviations
 
 }  // namespace
 
 EncodedLevel::EncodedLevel(double share) {
     const double v = std::clamp(share, kDarkest, 1.0), cube = v * v * v;
-    by_exponent = std::log(v), by_shoulder = (cube * cube - 1) / 6;
+    by_exponent = std::log(v);
+    by_shoulder = (cube * cube - 1) / 6;
 }
 
 void ToneCurve::include(const ToneSample& sample) {
@@ -33,7 +36,8 @@ void ToneCurve::include(const ToneSample& sample) {
         samples_.push_back(sample);
         return;
     }
-    samples_[next_] = sample, next_ = (next_ + 1) % kSamples;
+    samples_[next_] = sample;
+    next_ = (next_ + 1) % kSamples;
 }
 
 double ToneCurve::light(const EncodedLevel& level) const {
@@ -54,7 +58,8 @@ double ToneCurve::left_by(double exponent) const {
         if (range <= 0) continue;
         const double left = 4 * ((power(sample.middle) - dark) / range - 0.5);
         const double variance = square(sample.sigma) + square(kModelSigma);
-        sum += square(left) / variance - 1, weights += 1 / variance;
+        sum += square(left) / variance - 1;
+        weights += 1 / variance;
     }
     return weights > 0 ? std::sqrt(std::max(0.0, sum / weights)) : 0;
 }
@@ -78,8 +83,11 @@ void ToneCurve::fit() {
             const double off = -4 * (share - 0.5), sigma = std::hypot(sample.sigma, kModelSigma);
             const double weight = std::min(1.0, kHuber * sigma / std::abs(off)) / square(sigma);
             const double u = slope(&EncodedLevel::by_exponent), v = slope(&EncodedLevel::by_shoulder);
-            A.xx += weight * u * u, A.xy += weight * u * v, A.yy += weight * v * v;
-            x += weight * u * off, y += weight * v * off;
+            A.xx += weight * u * u;
+            A.xy += weight * u * v;
+            A.yy += weight * v * v;
+            x += weight * u * off;
+            y += weight * v * off;
         }
         exponent_ = std::clamp(exponent_ + (A.yy * x - A.xy * y) / A.det(), kLeastExponent, kMostExponent);
         shoulder_ = std::clamp(shoulder_ + (A.xx * y - A.xy * x) / A.det(), kLeastShoulder * exponent_,

@@ -53,8 +53,16 @@ Columns<R> columns(const Array& array, size_t n) {
 inline Vector vector_at(const double* v) { return {v[0], v[1], v[2]}; }
 inline Matrix matrix_at(const double* m) { return {vector_at(m), vector_at(m + 3), vector_at(m + 6)}; }
 
-inline void write(const Vector& v, double* to) { to[0] = v.x, to[1] = v.y, to[2] = v.z; }
-inline void write(const Matrix& m, double* to) { write(m.r0, to), write(m.r1, to + 3), write(m.r2, to + 6); }
+inline void write(const Vector& v, double* to) {
+    to[0] = v.x;
+    to[1] = v.y;
+    to[2] = v.z;
+}
+inline void write(const Matrix& m, double* to) {
+    write(m.r0, to);
+    write(m.r1, to + 3);
+    write(m.r2, to + 6);
+}
 
 /// Makes an array that owns its memory.
 template <class T = double>

@@ -64,7 +64,8 @@ auto candidates(const Markers& markers, const FramePoses& poses, const Detection
     auto [pairs, rows] = make<int64_t>({2, found.size()});
     auto [costs, to] = make({found.size()});
     for (const Candidate& pair : found) {
-        rows[found.size()] = pair.detection, *rows++ = pair.marker;
+        rows[found.size()] = pair.detection;
+        *rows++ = pair.marker;
         *to++ = pair.cost;
     }
     return std::make_tuple(pairs, costs);

@@ -36,7 +36,7 @@ auto reweigh_arrays(const EquationArray& equations, const Index& body, const Cov
 Out residuals_of(const EquationArray& equations, const Index& body, const In<double, -1, 12>& steps) {
     const EquationSystem system = system_of(equations, body, steps.shape(0));
     auto [both, to] = make({2, body.size()});
-    unlocked([&] { residuals(system, steps.data(), to); });
+    unlocked([&, to = to] { residuals(system, steps.data(), to); });
     return both;
 }
 

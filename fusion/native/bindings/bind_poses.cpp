@@ -52,7 +52,7 @@ Discs discs_of(const FramePoses& poses, const DiscColumns& discs) {
 Out views_of(const FramePoses& poses, const DiscColumns& columns_of) {
     const Discs discs = discs_of(poses, columns_of);
     auto [views, to] = make({11, discs.size()});
-    unlocked([&] { view_discs(poses, discs, to); });
+    unlocked([&, to = to] { view_discs(poses, discs, to); });
     return views;
 }
 
@@ -63,7 +63,7 @@ Out linearize_centres(const FramePoses& poses, const DiscColumns& columns_of, co
     const CentreObservations observed{discs, columns<2>(xy, discs.size()), columns<4>(whiten, discs.size()),
                                       single.data()};
     auto [equations, to] = make({discs.size(), 2, kErrors + 1});
-    unlocked([&] { linearize(poses, observed, reinterpret_cast<Equations*>(to)); });
+    unlocked([&, to = to] { linearize(poses, observed, reinterpret_cast<Equations*>(to)); });
     return equations;
 }
 
@@ -74,7 +74,7 @@ Out linearize_outlines(const FramePoses& poses, const DiscColumns& columns_of, c
     const OutlineObservations observed{discs, columns<2>(axes, discs.size()), angle.data(),
                                        columns<4>(scale, discs.size()), sigma.data()};
     auto [equations, to] = make({discs.size(), 2, kErrors + 1});
-    unlocked([&] { linearize(poses, observed, reinterpret_cast<Equations*>(to)); });
+    unlocked([&, to = to] { linearize(poses, observed, reinterpret_cast<Equations*>(to)); });
     return equations;
 }
 
@@ -89,7 +89,8 @@ Out shears_of(const Pairs& axes, const Numbers& angle, const Vectors& centre, co
         const Shape expected =
             outline(c.vector(k), d.vector(k), radius(k), Scale::of(columns<4>(scale, n), k));
         const Shear s = shear(measured, expected);
-        to[k] = s.along, to[n + k] = s.across;
+        to[k] = s.along;
+        to[n + k] = s.across;
     }
     return both;
 }

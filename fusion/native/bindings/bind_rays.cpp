@@ -56,8 +56,12 @@ auto ray_pairs_of(const Viewpoints& frames, const Index& frame, const Positions&
     auto [pairs, rows] = make<int64_t>({2, found.size()});
     auto [numbers, to] = make({2, found.size()});
     for (const RayPair& pair : found) {
-        rows[0] = pair.first, rows[found.size()] = pair.second, ++rows;
-        to[0] = pair.miss, to[found.size()] = pair.range, ++to;
+        rows[0] = pair.first;
+        rows[found.size()] = pair.second;
+        ++rows;
+        to[0] = pair.miss;
+        to[found.size()] = pair.range;
+        ++to;
     }
     return std::make_tuple(pairs, numbers);
 }

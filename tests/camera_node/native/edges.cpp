@@ -19,11 +19,19 @@ constexpr double kAllAgree = 1e4;  // grey levels: with this scale all weights a
 Parameters seen(double diameter, double slant) {
     const double r = diameter / 2, turn = 0.7, c = std::cos(turn), s = std::sin(turn);
     Parameters p{};
-    p[kBright] = 190, p[kDark] = 40, p[kGround] = 90, p[kBlur] = 0.8, p[kRatio] = 0.6, p[kCard] = kCardRatio;
-    p[kX] = 128.3, p[kY] = 127.6;
-    p[kAxx] = r * (slant * c * c + s * s), p[kAyy] = r * (slant * s * s + c * c);
+    p[kBright] = 190;
+    p[kDark] = 40;
+    p[kGround] = 90;
+    p[kBlur] = 0.8;
+    p[kRatio] = 0.6;
+    p[kCard] = kCardRatio;
+    p[kX] = 128.3;
+    p[kY] = 127.6;
+    p[kAxx] = r * (slant * c * c + s * s);
+    p[kAyy] = r * (slant * s * s + c * c);
     p[kAxy] = r * (slant - 1) * c * s;
-    p[kGx] = c * std::sqrt(1 - slant * slant) / 10, p[kGy] = s * std::sqrt(1 - slant * slant) / 10;
+    p[kGx] = c * std::sqrt(1 - slant * slant) / 10;
+    p[kGy] = s * std::sqrt(1 - slant * slant) / 10;
     return p;
 }
 
@@ -43,7 +51,8 @@ int main() {
                           pixels);
             const int parts = pixels.part_count;
             const auto apart = products(pixels, p);
-            pixels.parts[0] = {kAnyEdge, 0, pixels.count}, pixels.part_count = 1;
+            pixels.parts[0] = {kAnyEdge, 0, pixels.count};
+            pixels.part_count = 1;
             const auto together = products(pixels, p);
             double worst = 0;
             for (int i = 0; i < kCount; ++i)

@@ -99,7 +99,10 @@ bool survives(Random& random, bool by_paper) {
     roundel::Detector detector(limits, between(random, 0, 3) ? 1.0 : 0.1, by_paper);
     int width = between(random, 0, 90), height = between(random, 0, 90);
     for (int k = 0; k < 3; ++k) {
-        if (!between(random, 0, 3)) width = between(random, 0, 260), height = between(random, 0, 200);
+        if (!between(random, 0, 3)) {
+            width = between(random, 0, 260);
+            height = between(random, 0, 200);
+        }
         Picture picture(width, height, width + between(random, 0, 1) * between(random, 0, 70));
         if (width && height) paint_any(picture, random);
         for (const auto& found : detector.detect(picture.view).roundels)

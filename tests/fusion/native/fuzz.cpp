@@ -91,7 +91,10 @@ bool estimate(Random& random, double wild) {
               outlines.data());
     std::vector<ErrorMatrix> H(bodies);
     std::vector<ErrorVector> g(bodies);
-    for (size_t b = 0; b < bodies; ++b) H[b] = random.square(wild), g[b][0] = random.number(1, wild);
+    for (size_t b = 0; b < bodies; ++b) {
+        H[b] = random.square(wild);
+        g[b][0] = random.number(1, wild);
+    }
     Numbers weights(n, 1);
     const EquationSystem system{rows.data(), body.data(), n, bodies};
     reweigh(system, H.data(), g.data(), weights.data());
@@ -143,15 +146,16 @@ bool intersect(Random& random, double wild) {
     const size_t frames = 1 + random.below(5), n = random.below(60), sizes = 1 + random.below(3);
     std::vector<Viewpoint> viewpoints;
     for (size_t f = 0; f < frames; ++f)
-        viewpoints.push_back({int64_t(random.below(3)), random.vector(3, wild), random.number(0.01, wild)});
+        viewpoints.push_back({int64_t(random.below(3)), random.vector(3, wild)});
     const Indices frame = random.indices(n, frames);
     std::vector<Vector> directions;
     for (size_t k = 0; k < n; ++k) {
         const Vector d = random.vector(1, wild);
         directions.push_back((1 / std::sqrt(dot(d, d))) * d);
     }
-    const Numbers reach = random.numbers(n, 0.1, wild), limits = random.numbers(2 * n * sizes, 9, wild);
-    const Rays rays{frame.data(), directions.data(), reach.data(), limits.data(), n, sizes};
+    const Numbers reach = random.numbers(n, 0.1, wild), limits = random.numbers(2 * n * sizes, 9, wild),
+                  moved = random.numbers(n, 0.01, wild);
+    const Rays rays{frame.data(), directions.data(), reach.data(), moved.data(), limits.data(), n, sizes};
     const std::vector<double> ranges = densest_ranges(rays, viewpoints);
     for (size_t k = 0; k < n; ++k)
         if (std::isfinite(ranges[k]) && !(ranges[k] > 0 && ranges[k] <= rays.max_range(k) * (1 + 1e-9)))
@@ -164,9 +168,11 @@ bool intersect(Random& random, double wild) {
 bool undistort(Random& random, double wild) {
     const size_t columns = 1 + random.below(4), rows = 1 + random.below(4), n = random.below(30);
     const Numbers cells = random.numbers(20 * (columns + 2) * (rows + 2), 1, wild);
-    const Numbers uv = random.numbers(2 * n, 100, wild);
+    const Numbers uv = random.numbers(2 * n, 100, wild), axes = random.numbers(2 * n, 30, wild),
+                  angle = random.numbers(n, 1, wild);
     Numbers xy(2 * n), scale(4 * n);
-    look_up({cells.data(), int64_t(columns), int64_t(rows), 32}, uv.data(), n, xy.data(), scale.data());
+    const Outlines seen{uv.data(), axes.data(), angle.data(), n};
+    look_up({cells.data(), int64_t(columns), int64_t(rows), 32}, seen, xy.data(), scale.data());
     return true;
 }
 
