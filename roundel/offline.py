@@ -28,8 +28,8 @@ from calib.wand.scale import SIGMA_M, Distance
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
-from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
+from camera_node.simulation.simulated_camera import render_recording
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import RobotPose, Robots

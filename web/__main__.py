@@ -19,7 +19,7 @@ from camera_node.foundation.config import example_file
 from camera_node.foundation.logs import set_up_logging
 from camera_node.foundation.program import run
 from camera_node.foundation.service import stopped_by_signals
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from web.state.feed import Feed
 from web.state.replay import RecordingPlayer
 from web.state.subscription import Subscription

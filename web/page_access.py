@@ -28,8 +28,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Data
 
 from camera_node.foundation.config import load_yaml
-from camera_node.foundation.errors import ConfigError
-from camera_node.foundation.text import printable
+from camera_node.foundation.errors import ConfigError, printable
 from web.errors import WebError
 
 log = logging.getLogger("web.page")

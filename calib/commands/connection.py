@@ -14,7 +14,7 @@ from calib.rig.rig import Rig
 from camera_node.foundation.errors import NetworkError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestError
-from camera_node.protocol.server_address import LOCAL, ServerAddress
+from camera_node.protocol.server_connection import LOCAL, ServerAddress
 from camera_node.protocol.session import open_client
 
 

@@ -19,9 +19,8 @@ from calib.formats.lens_models import with_coefficients
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array
-from camera_node.foundation.config import write_atomically
+from camera_node.foundation.config import read_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.foundation.yaml_file import read_yaml
 from camera_node.geometry.pose import Pose, invert
 
 FROM_ZERO = PixelOrigin(0)

@@ -17,9 +17,8 @@ from calib.errors import CalibrationError
 from calib.formats.data import ForeignData, PixelOrigin, make_camera
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.foundation.config import is_name, write_atomically
+from camera_node.foundation.config import is_name, read_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.foundation.yaml_file import read_yaml
 from camera_node.geometry.pose import invert
 
 FROM_ZERO = PixelOrigin(0)

@@ -5,8 +5,8 @@ import threading
 
 import zenoh
 
-from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
+from camera_node.protocol.session import guarded
 
 LISTEN_S = 2.5  # a camera publishes its status once a second
 MAX_CAMERAS = 256

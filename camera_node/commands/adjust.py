@@ -21,7 +21,7 @@ from camera_node.protocol.camera_requests import (
     request_snapshot,
 )
 from camera_node.protocol.messages import Settings
-from camera_node.protocol.server_address import ServerAddress
+from camera_node.protocol.server_connection import ServerAddress
 from camera_node.protocol.session import open_client
 from camera_node.sources.frame import parse_controls
 

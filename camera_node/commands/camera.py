@@ -18,7 +18,7 @@ from camera_node.foundation.errors import CameraAbsentError, ConfigError
 from camera_node.foundation.service import ServiceManager, stopped_by_signals
 from camera_node.foundation.supervisor import Supervisor
 from camera_node.foundation.terminal import say
-from camera_node.protocol.discovery import FoundArena, choose_arena, find_arenas
+from camera_node.protocol.server_connection import FoundArena, choose_arena, find_arenas
 from camera_node.sources.drivers import local_cameras
 from camera_node.sources.frame import SourceSettings, without_credentials
 

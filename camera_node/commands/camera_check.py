@@ -16,7 +16,7 @@ from camera_node.detection.sharpness import edge_blur_px
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.errors import CameraError
 from camera_node.foundation.terminal import progress_bar, say
-from camera_node.node.status import BLURRED_PX, advise, advise_focus
+from camera_node.node.node_status import BLURRED_PX, advise, advise_focus
 from camera_node.sources.frame import Frame, Source, SourceSettings, without_credentials
 
 MAX_JITTER_MS = 1.0  # of the stamps; a robot at 1 m/s moves by 1 mm in this time

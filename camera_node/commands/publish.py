@@ -15,7 +15,7 @@ from camera_node.foundation.config import example_file, require_name
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.service import ServiceManager, StopEvent, stopped_by_signals
 from camera_node.protocol.registration import CameraRegistration
-from camera_node.simulation.camera import SimulatedCamera
+from camera_node.simulation.simulated_camera import SimulatedCamera
 from camera_node.sources.drivers import SourceIdentity, driver_of, identify, is_simulation
 from camera_node.sources.frame import Source, SourceSettings, is_url
 from camera_node.sources.network_stream import open_stream
@@ -96,7 +96,7 @@ class Publish:
 
     def _open_session(self, stop: StopEvent) -> "zenoh.Session | None":
         """Wait for the server, if there is to be one; the service is ready while it waits. None once `stop` is set."""
-        from camera_node.protocol.connection import ServerConnection
+        from camera_node.protocol.server_connection import ServerConnection
         from camera_node.protocol.session import open_router
 
         if self.listen:
@@ -118,7 +118,8 @@ class Publish:
         self, session: "zenoh.Session", identity: SourceIdentity, first_t_ns: int | None, stop: StopEvent
     ) -> None:
         """Publish under the name that the server gives; start again under each new name."""
-        from camera_node.node.registration import RegisteredNode, Registration, camera_id
+        from camera_node.node.node import RegisteredNode
+        from camera_node.node.server_registration import Registration, camera_id
 
         request = CameraRegistration(
             id=camera_id(identity.key),

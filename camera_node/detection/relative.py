@@ -7,45 +7,14 @@ See docs/relative.md.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.detection.disc_pose import DiscPoses, distances_by_principal_axis, locate_all
-from camera_node.detection.roundels import DetectedRoundels
+from camera_node.detection.roundels import DIAMETERS_M, DetectedRoundels, LocatedRoundels
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 
 MAX_LOCATED = 64  # of one frame, the largest ones: the work for a frame is bounded
-DIAMETERS_M = 0.001, 10.0  # of the black disc
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LocatedRoundels:
-    """N roundels located by one camera, in its frame (OpenCV: z forward, y down), metres.
-
-    Attributes:
-        position: (N, 3) expected position of the disc's centre over both normals.
-        cov: (N, 3, 3) covariance of `position`, with the distance between the positions of both normals; without
-            errors of the lens and of the diameter.
-        normals: (N, 2, 3) unit normals out of the printed side, the more probable one first. Both are equal where the
-            image determines one.
-        probability: (N, 2) of the normals.
-        normal_sigma: (N, 2) standard deviation of each normal in its least certain direction, radians, to first order.
-        axis_distance: (N,) distance by the principal axis, Section III-C of Faigl et al., ICRA 2013.
-        id, track: (N,) as in `Roundels`.
-    """
-
-    position: Array
-    cov: Array
-    normals: Array
-    probability: Array
-    normal_sigma: Array
-    axis_distance: Array
-    id: NDArray[np.int32]
-    track: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        return len(self.position)
 
 
 @dataclass(frozen=True)

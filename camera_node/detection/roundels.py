@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array
 
+DIAMETERS_M = 0.001, 10.0  # of the black disc of a roundel that can be located
+
 
 @dataclass(frozen=True, slots=True)
 class Roundel:
@@ -119,3 +121,32 @@ class DetectedRoundels(Roundels):
     def __getitem__(self, k: int) -> Roundel:
         # Dataclasses with slots do not support super() without arguments.
         return replace(Roundels.__getitem__(self, k), offset_px=self.offset_px[k], pose_cov=self.pose_cov[k])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocatedRoundels:
+    """N roundels located by one camera, in its frame (OpenCV: z forward, y down), metres.
+
+    Attributes:
+        position: (N, 3) expected position of the disc's centre over both normals.
+        cov: (N, 3, 3) covariance of `position`, with the distance between the positions of both normals; without
+            errors of the lens and of the diameter.
+        normals: (N, 2, 3) unit normals out of the printed side, the more probable one first. Both are equal where the
+            image determines one.
+        probability: (N, 2) of the normals.
+        normal_sigma: (N, 2) standard deviation of each normal in its least certain direction, radians, to first order.
+        axis_distance: (N,) distance by the principal axis, Section III-C of Faigl et al., ICRA 2013.
+        id, track: (N,) as in `Roundels`.
+    """
+
+    position: Array
+    cov: Array
+    normals: Array
+    probability: Array
+    normal_sigma: Array
+    axis_distance: Array
+    id: NDArray[np.int32]
+    track: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.position)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Errors that a user can fix, and how programs report them.
+"""Errors that a user can fix, and how programs report them on one line.
 
     RoundelError
     ├── ConfigError          a file or an option is missing or invalid
@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 USER_ERROR, TEMPORARY_FAILURE = 2, 75  # exit codes; the second is EX_TEMPFAIL of sysexits.h
+MAX_LINE = 500  # characters of one message
 
 
 class RoundelError(Exception):
@@ -62,3 +63,13 @@ def check_command(
     similar = difflib.get_close_matches(arguments[0], known, 1)
     hint = f"did you mean {similar[0]}?" if similar else f"the commands are {', '.join(known)}"
     raise ConfigError(f"there is no command '{arguments[0]}'; {hint} ({remedy})")
+
+
+def printable(text: object, limit: int = MAX_LINE) -> str:
+    """A text from a file or a network for one line of a terminal or a log.
+
+    What is not printable is escaped, and what exceeds `limit` characters is left out.
+    """
+    shown = str(text)[: limit + 1]
+    escaped = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
+    return escaped if len(escaped) <= limit else escaped[:limit] + "..."

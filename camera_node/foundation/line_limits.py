@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from camera_node.foundation.errors import printable
 from camera_node.foundation.rate_limit import RateLimit
-from camera_node.foundation.text import printable
 
 MAX_KINDS = 256  # further ones are limited together
 DIGEST_KINDS = 16  # quoted in a digest ...

@@ -16,8 +16,8 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+from camera_node.foundation.errors import MAX_LINE, printable
 from camera_node.foundation.line_limits import LineLimiter, LogLimits, Released
-from camera_node.foundation.text import MAX_LINE, printable
 
 
 def about(name: str) -> dict[str, str]:

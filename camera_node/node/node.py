@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import zenoh
 
@@ -18,16 +17,16 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import draw_refused, draw_roundels
 from camera_node.detection.refusals import explain
 from camera_node.detection.relative import DiscLocalizer
+from camera_node.foundation.errors import RoundelError
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.foundation.service import ServiceManager
 from camera_node.node.clock_sync import ClockSync
-from camera_node.node.intrinsics import RigLens
+from camera_node.node.node_status import NodeStatistics
 from camera_node.node.preview import Content, PreviewPublisher
-from camera_node.node.relative import RelativePublisher
-from camera_node.node.settings import apply_settings, read_settings
-from camera_node.node.status import DetectedFrame, NodeStatistics
-from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.messages import CameraStatus, Detections, Keys, Settings, encode
+from camera_node.node.rig_lens import RigLens
+from camera_node.node.server_registration import Registration, set_fields
+from camera_node.protocol.messages import CameraStatus, Detections, Keys, RelativePositions, Settings, encode
+from camera_node.protocol.registration import CameraAssignment
 from camera_node.protocol.requests import (
     RequestError,
     encode_jpeg,
@@ -39,7 +38,7 @@ from camera_node.protocol.requests import (
     respond,
     sender_of,
 )
-from camera_node.protocol.session import ServerWatch
+from camera_node.protocol.session import ServerWatch, guarded
 from camera_node.sources.frame import Frame, Source
 
 log = logging.getLogger("camera_node")
@@ -107,7 +106,7 @@ class Node:
         self._changes = RateLimit(CHANGES_HZ, CHANGES_HZ)
         self._closed = threading.Event()
         self._previews: PreviewPublisher | None = None
-        self._relative: RelativePublisher | None = None
+        self._relative: zenoh.Publisher | None = None
         self._rig_lens: RigLens | None = None
 
     def run(self) -> None:
@@ -122,13 +121,7 @@ class Node:
             publisher = self._open(stack, service)
             service.ready()
             for seq, frame in enumerate(self._source):
-                detected = self._detect(frame)
-                header = self._describe(seq, frame)
-                publisher.put(self._encode(detected, header))
-                if self._relative is not None:
-                    size = (frame.image.shape[1], frame.image.shape[0])
-                    self._relative.put(detected.roundels, size, **header)
-                self._statistics.count(detected)
+                self._process(seq, frame, publisher)
                 service.progress()
 
     def close(self) -> None:
@@ -150,12 +143,39 @@ class Node:
         if wanted.readout_us is not None:
             self._readout_us = wanted.readout_us
 
-    def _detect(self, frame: Frame) -> DetectedFrame:
+    def _process(self, seq: int, frame: Frame, publisher: zenoh.Publisher) -> None:
+        """From a frame to its messages: detection, refinement by the lens, server's time, publication."""
+        height, width = frame.image.shape
         begun_ns = time.perf_counter_ns()
-        published = roundels = self._detector.detect(frame.image)
-        if self._rig_lens is not None:
-            published = self._rig_lens.refine(roundels, (frame.image.shape[1], frame.image.shape[0]))
-        return DetectedFrame(frame, roundels, published, (time.perf_counter_ns() - begun_ns) / 1000)
+        roundels = self._detector.detect(frame.image)
+        refined = self._rig_lens.refine(roundels, (width, height)) if self._rig_lens else roundels
+        detect_us = (time.perf_counter_ns() - begun_ns) / 1000
+        t_ns, clock_error_us = self._stamp(frame)
+        header = {
+            "camera": self.name,
+            "seq": seq,
+            "t_ns": t_ns,
+            "exposure_us": frame.exposure_us,
+            "sent_ns": self._clock.now_ns(),
+            "clock_error_us": clock_error_us,
+        }
+        message = Detections.pack(
+            refined,
+            publisher=self._publisher,
+            readout_us=frame.readout_us if self._readout_us is None else self._readout_us,
+            detect_us=detect_us,
+            width=width,
+            height=height,
+            found_ratios=self._detector.found_ratios,
+            **header,
+        )
+        publisher.put(encode(message))
+        if self._relative is not None and (localizer := self._options.localizer) is not None:
+            localizer.check_size(width, height)
+            located = localizer.locate(roundels)
+            positions = RelativePositions.pack(located, diameter_m=localizer.diameter_m, **header)
+            self._relative.put(encode(positions))
+        self._statistics.count(frame.image, roundels, detect_us)
 
     def _stamp(self, frame: Frame) -> tuple[int, float]:
         """The frame's capture time in the server's time, ns, and the bound of its error by clocks, us."""
@@ -165,33 +185,6 @@ class Node:
         if estimate is None:
             return frame.t_ns, math.nan
         return frame.t_ns + estimate[0], estimate[1] / 1000 + frame.error_us
-
-    def _describe(self, seq: int, frame: Frame) -> dict[str, Any]:
-        """The fields that all messages of a frame have."""
-        t_ns, clock_error_us = self._stamp(frame)
-        return {
-            "camera": self.name,
-            "seq": seq,
-            "t_ns": t_ns,
-            "exposure_us": frame.exposure_us,
-            "sent_ns": self._clock.to_server(time.time_ns()),
-            "clock_error_us": clock_error_us,
-        }
-
-    def _encode(self, detected: DetectedFrame, header: dict[str, Any]) -> bytes:
-        frame = detected.frame
-        height, width = frame.image.shape
-        message = Detections.pack(
-            detected.published,
-            publisher=self._publisher,
-            readout_us=frame.readout_us if self._readout_us is None else self._readout_us,
-            detect_us=detected.detect_us,
-            width=width,
-            height=height,
-            found_ratios=self._detector.found_ratios,
-            **header,
-        )
-        return encode(message)
 
     def _open(self, stack: contextlib.ExitStack, service: ServiceManager) -> zenoh.Publisher:
         """Declare all publications, queryables and tokens, to be undeclared by `stack`."""
@@ -214,14 +207,19 @@ class Node:
             stack.callback(queryable.undeclare)
         stack.callback(session.liveliness().declare_token(keys.camera_alive(name)).undeclare)
         previews = self._previews = PreviewPublisher(
-            session, keys.preview(name), name, self._latest, lambda: self._clock.to_server(time.time_ns())
+            session, keys.preview(name), name, self._latest, self._clock.now_ns
         )
         stack.callback(previews.close)
         self._rig_lens = RigLens(session, keys, name, self._statistics.count_refusal)
         stack.callback(self._rig_lens.close)
         if self._options.localizer is not None:
-            self._relative = RelativePublisher(session, keys.relative(name), self._options.localizer)
-            stack.callback(self._relative.close)
+            self._relative = session.declare_publisher(
+                keys.relative(name),
+                congestion_control=control.DROP,  # old positions are useless
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+            )
+            stack.callback(self._relative.undeclare)
         watch = ServerWatch(session, keys.fusion_alive)
         stack.callback(watch.close)
         self._clock.start()
@@ -239,7 +237,7 @@ class Node:
     def _latest(self) -> Content | None:
         """The latest frame, its roundels and the mask, for previews."""
         latest = self._statistics.latest
-        return (latest.frame.image, latest.roundels, self._detector.settings["mask"]) if latest else None
+        return (*latest, self._detector.settings["mask"]) if latest else None
 
     def _await_subscriber(self, publisher: zenoh.Publisher) -> None:
         """Wait until there is a subscriber, so that it receives all frames of a recording."""
@@ -279,7 +277,7 @@ class Node:
         log.info(text, self.name, status.fps, status.width, status.height, self._keys.arena)
 
     def _summarize(self) -> CameraStatus:
-        now_ns = self._clock.to_server(time.time_ns())
+        now_ns = self._clock.now_ns()
         return self._statistics.summarize(now_ns, self._clock.estimate(), self._source, self._detector)
 
     def _answer(self, answer: Callable[[zenoh.Query], bytes], query: zenoh.Query) -> None:
@@ -292,13 +290,13 @@ class Node:
             raise RequestError(f"more than {SNAPSHOTS_HZ:g} snapshots a second; ask again later")
         if latest is None:
             raise RequestError("no frame yet; ask again when the camera delivers")
-        image, why = latest.frame.image, parse_flag(query.parameters, "why")
+        (image, roundels), why = latest, parse_flag(query.parameters, "why")
         if why and not self._explanations.passes():
             raise RequestError(f"more than {EXPLANATIONS_HZ:g} explanations a second; ask again later")
         if why or parse_flag(query.parameters, "draw"):
-            canvas = draw_roundels(image, latest.roundels)
+            canvas = draw_roundels(image, roundels)
             if why:
-                draw_refused(canvas, explain(self._detector, image, latest.roundels))
+                draw_refused(canvas, explain(self._detector, image, roundels))
             image = canvas
         return encode_jpeg(image, parse_quality(query.parameters))
 
@@ -317,3 +315,76 @@ class Node:
                 )
                 self.on_settings(wanted)
             return encode_reply(payload, read_settings(self._source, self._detector, self._readout_us))
+
+
+def read_settings(source: Source, detector: Detector, readout_us: float | None = None) -> Settings:
+    """The settings in use."""
+    return Settings(
+        exposure_us=source.exposure_us,
+        gain=source.gain,
+        controls=dict(source.controls) or None,
+        readout_us=readout_us,
+        **detector.settings,
+    )
+
+
+def apply_settings(wanted: Settings, source: Source, detector: Detector) -> Detector:
+    """Apply the settings that are not None, all of them or none.
+
+    Returns:
+        The detector for the next frame, which continues the tracks of `detector`.
+
+    Raises:
+        ConfigError: the source or the detector does not have a setting or refuses its value.
+    """
+    changes = {name: getattr(wanted, name) for name in detector.settings}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    adjusted = detector.adjusted(**changes) if changes else detector
+    if (wanted.exposure_us, wanted.gain, wanted.controls) != (None, None, None):
+        source.adjust(wanted.exposure_us, wanted.gain, wanted.controls)
+    return adjusted
+
+
+class RegisteredNode:
+    """Runs a node under its name and with its settings, and applies the changes of both."""
+
+    def __init__(self, registration: Registration) -> None:
+        self._registration = registration
+        self._node: Node | None = None
+        self._next: CameraAssignment | None = None
+        registration.follow(self._change)
+
+    def run(self, node: Node, assignment: CameraAssignment) -> CameraAssignment | None:
+        """Run a node until it ends.
+
+        Returns:
+            The assignment with its new name if it was renamed; None if its source ended.
+        """
+        self._node, self._next = node, None
+        node.on_settings = self._registration.store
+        self._apply(node, assignment.settings)
+        if (latest := self._registration.assigned) is not None and latest.name != node.name:
+            return latest  # renamed before it ran
+        node.run()
+        return self._next
+
+    def _change(self, assignment: CameraAssignment) -> None:
+        node = self._node
+        if node is None:
+            return
+        if assignment.name != node.name:
+            log.warning("camera %s is now called %s", node.name, assignment.name)
+            self._next = assignment
+            node.close()
+        else:
+            self._apply(node, assignment.settings)
+
+    def _apply(self, node: Node, settings: Settings) -> None:
+        """Apply the stored settings one by one: those that the source does not have must not prevent the others."""
+        for name, value in set_fields(settings).items():
+            if name == "version":
+                continue
+            try:
+                node.adjust(Settings(**{name: value}))
+            except RoundelError as error:
+                log.warning("the stored setting %s of %s is not used: %s", name, node.name, error)

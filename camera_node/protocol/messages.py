@@ -2,34 +2,32 @@
 """Defines the messages of a camera: MessagePack maps with arrays as little-endian binary columns, and Zenoh keys."""
 
 import math
-from typing import TypeVar
+from collections.abc import Mapping
+from typing import ClassVar, TypeVar
 
 import msgspec
 import numpy as np
 
-from camera_node.detection.roundels import Roundels
+from camera_node.detection.roundels import DIAMETERS_M, LocatedRoundels, Roundels
+from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import is_name, require_name
-from camera_node.protocol.jpeg import jpeg_size
 
 VERSION = 1
 MAX_BYTES = 1 << 24  # of a message, unless its class has a MAX_BYTES of its own
 MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
+MAX_POSITIONS = 256  # in one message of relative positions; messages with more are refused
+MAX_DISTANCE_M = 1e4
+NORM_ERROR = 1e-3  # of a unit normal; float32 and other programs round
 MAX_RATIOS = 16  # kinds of prints of one camera
 MAX_PREVIEW_BYTES, MAX_PREVIEW_SIDE = 1 << 16, 1024  # of a small picture; its side in pixels
 MAX_CONTROLS, MAX_CONTROL = 64, 64  # controls of one camera; characters of a name or of a text
 MAX_READOUT_US = 1e6  # a frame takes no longer
 MAX_VARIANCE_PX2 = 1e4  # of a centre's coordinate; larger ones carry no information
 F8, F4, I4 = np.dtype("<f8"), np.dtype("<f4"), np.dtype("<i4")
-COLUMNS = {  # of detections: type and number of values in each row
-    "uv": (F8, 2),
-    "cov": (F4, 3),
-    "axes_px": (F4, 2),
-    "angle_rad": (F4, 1),
-    "ratio": (F4, 1),
-    "contrast": (F4, 1),
-    "id": (I4, 1),
-    "track": (I4, 1),
-}
+UPPER = np.triu_indices(3)  # xx, xy, xz, yy, yz, zz
+JPEG_START = b"\xff\xd8"
+JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame, ITU-T T.81 table B.1
+JPEG_SIZE_BYTES = 9  # of a start of frame until its width
 T = TypeVar("T", bound=msgspec.Struct)
 ControlValue = bool | int | float | str  # of a camera's control, such as focus_absolute or TriggerMode
 
@@ -86,7 +84,42 @@ class MessageError(ValueError):
     """Invalid bytes in place of a message. Receivers count them and continue."""
 
 
-class Detections(msgspec.Struct, frozen=True, kw_only=True):
+class ColumnMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """A message with columns: arrays as little-endian bytes, one row for each roundel.
+
+    Attributes:
+        COLUMNS: type and number of values in each row; the first column gives the number of rows.
+        MAX_ROWS: messages with more are refused.
+    """
+
+    COLUMNS: ClassVar[dict[str, tuple[np.dtype, int]]]
+    MAX_ROWS: ClassVar[int]
+
+    @classmethod
+    def _to_bytes(cls, columns: Mapping[str, np.ndarray]) -> dict[str, bytes]:
+        return {name: columns[name].astype(dtype).tobytes() for name, (dtype, _) in cls.COLUMNS.items()}
+
+    def __len__(self) -> int:
+        name, (dtype, width) = next(iter(self.COLUMNS.items()))
+        return len(getattr(self, name)) // (width * dtype.itemsize)
+
+    def _column(self, name: str) -> np.ndarray:
+        dtype, width = self.COLUMNS[name]
+        column = np.frombuffer(getattr(self, name), dtype).astype(np.int32 if dtype is I4 else float)
+        return column if width == 1 else column.reshape(-1, width)
+
+    def _check_sizes(self) -> None:
+        """Raise MessageError unless the sizes of the columns agree."""
+        n = len(self)
+        if n > self.MAX_ROWS:
+            raise MessageError(f"{n} roundels; a message has at most {self.MAX_ROWS}")
+        for name, (dtype, width) in self.COLUMNS.items():
+            size = len(getattr(self, name))
+            if size != n * width * dtype.itemsize:
+                raise MessageError(f"column {name} of {size} bytes for {n} roundels")
+
+
+class Detections(ColumnMessage, frozen=True, kw_only=True):
     """All roundels of one frame. `t_ns` is the middle of the exposure in the server's time (Unix, nanoseconds).
 
     A rolling shutter exposes the rows one after another, during `readout_us`: `t_ns` is that of the middle of the
@@ -97,6 +130,18 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     `axes_px` (N, 2) <f4 full major and minor axis; `angle_rad`, `ratio`, `contrast` (N,) <f4;
     `id` and `track` (N,) <i4, -1 for none. Unknown values are NaN.
     """
+
+    COLUMNS: ClassVar = {
+        "uv": (F8, 2),
+        "cov": (F4, 3),
+        "axes_px": (F4, 2),
+        "angle_rad": (F4, 1),
+        "ratio": (F4, 1),
+        "contrast": (F4, 1),
+        "id": (I4, 1),
+        "track": (I4, 1),
+    }
+    MAX_ROWS: ClassVar = MAX_ROUNDELS
 
     version: int = VERSION
     camera: str
@@ -123,35 +168,21 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def pack(cls, roundels: Roundels, **header) -> "Detections":
         """Build a message from `roundels`; `header` contains the fields that are not columns."""
-        columns = {name: getattr(roundels, name) for name in COLUMNS}
+        columns = {name: getattr(roundels, name) for name in cls.COLUMNS}
         columns["cov"] = roundels.cov.reshape(-1, 4)[:, [0, 1, 3]]
-        return cls(**{name: columns[name].astype(COLUMNS[name][0]).tobytes() for name in COLUMNS}, **header)
-
-    def __len__(self) -> int:
-        return len(self.uv) // 16
+        return cls(**cls._to_bytes(columns), **header)
 
     @np.errstate(invalid="ignore")  # the conversion turns signalling NaNs into quiet ones
     def unpack(self) -> Roundels:
         """Convert the columns to arrays."""
-        columns = {name: self._column(name) for name in COLUMNS}
+        columns = {name: self._column(name) for name in self.COLUMNS}
         columns["cov"] = columns["cov"][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
         return Roundels(**columns)
-
-    def _column(self, name: str) -> np.ndarray:
-        dtype, width = COLUMNS[name]
-        column = np.frombuffer(getattr(self, name), dtype).astype(np.int32 if dtype is I4 else float)
-        return column if width == 1 else column.reshape(-1, width)
 
     @np.errstate(invalid="ignore")  # as in `unpack`
     def check(self) -> None:
         """Raise MessageError unless sizes agree, centres are finite and covariances positive definite and small."""
-        n = len(self)
-        if n > MAX_ROUNDELS:
-            raise MessageError(f"{n} roundels; a message has at most {MAX_ROUNDELS}")
-        for name, (dtype, width) in COLUMNS.items():
-            size = len(getattr(self, name))
-            if size != n * width * dtype.itemsize:
-                raise MessageError(f"column {name} of {size} bytes for {n} roundels")
+        self._check_sizes()
         self._check_header()
         uu, uv, vv = self._column("cov").T  # comparisons with NaN are False
         valid = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
@@ -175,6 +206,117 @@ class Detections(msgspec.Struct, frozen=True, kw_only=True):
 def _check_ratios(ratios: tuple[float, ...]) -> None:
     if len(ratios) > MAX_RATIOS or not all(0 < ratio < 1 for ratio in ratios):
         raise MessageError("found_ratios are too many or not in (0, 1)")
+
+
+class RelativePositions(ColumnMessage, frozen=True, kw_only=True):
+    """The roundels of one frame relative to the camera, which locates them by itself.
+
+    `camera`, `seq` and the times are those of its `Detections`. Columns with one row for each roundel, as in
+    `LocatedRoundels`: `position` (N, 3) <f8; `cov` (N, 6) <f8 xx, xy, xz, yy, yz, zz; `normals` (N, 2, 3) <f4;
+    `probability` (N,) <f4 of the first normal; `normal_sigma` (N, 2) <f4; `axis_distance` (N,) <f4; `id` and `track`
+    (N,) <i4, -1 for none.
+    """
+
+    COLUMNS: ClassVar = {
+        "position": (F8, 3),
+        "cov": (F8, 6),
+        "normals": (F4, 6),
+        "probability": (F4, 1),
+        "normal_sigma": (F4, 2),
+        "axis_distance": (F4, 1),
+        "id": (I4, 1),
+        "track": (I4, 1),
+    }
+    MAX_ROWS: ClassVar = MAX_POSITIONS
+
+    version: int = VERSION
+    camera: str
+    seq: int
+    t_ns: int
+    exposure_us: float = 0.0
+    sent_ns: int = 0
+    clock_error_us: float = 0.0
+    diameter_m: float
+    position: bytes
+    cov: bytes
+    normals: bytes
+    probability: bytes
+    normal_sigma: bytes
+    axis_distance: bytes
+    id: bytes
+    track: bytes
+
+    @classmethod
+    def pack(cls, located: LocatedRoundels, **header) -> "RelativePositions":
+        """Build a message from `located`; `header` contains the fields that are not columns."""
+        columns = {name: getattr(located, name) for name in cls.COLUMNS}
+        columns["cov"] = located.cov[:, *UPPER]
+        columns["probability"] = located.probability[:, 0]
+        return cls(**cls._to_bytes(columns), **header)
+
+    @np.errstate(invalid="ignore")  # the conversion turns signalling NaNs into quiet ones
+    def unpack(self) -> LocatedRoundels:
+        """Convert the columns to arrays."""
+        columns = {name: self._column(name) for name in self.COLUMNS}
+        columns["cov"] = self._covariances()
+        columns["normals"] = columns["normals"].reshape(-1, 2, 3)
+        first = columns["probability"]
+        columns["probability"] = np.stack([first, 1 - first], axis=1)
+        return LocatedRoundels(**columns)
+
+    def _covariances(self) -> Array:
+        values = self._column("cov")
+        cov = np.empty((len(values), 3, 3))
+        cov[:, UPPER[0], UPPER[1]] = cov[:, UPPER[1], UPPER[0]] = values
+        return cov
+
+    @np.errstate(invalid="ignore", over="ignore")  # as in `unpack`
+    def check(self) -> None:
+        """Raise MessageError unless sizes agree, and positions, covariances, normals and probabilities are possible."""
+        self._check_sizes()
+        self._check_header()
+        self._check_positions()
+        normals = self._column("normals").reshape(-1, 3)  # comparisons with NaN are False
+        if not (np.abs(np.linalg.norm(normals, axis=1) - 1) < NORM_ERROR).all():
+            raise MessageError("a normal is not of length 1")
+        probability = self._column("probability")
+        sigma = self._column("normal_sigma")
+        if not ((probability >= 0) & (probability <= 1)).all() or not (sigma >= 0).all():
+            raise MessageError("a probability is not in [0, 1], or a standard deviation not above 0")
+
+    def _check_positions(self) -> None:
+        if not (np.abs(self._column("position")) < MAX_DISTANCE_M).all():
+            raise MessageError("a position is NaN or out of range")
+        cov = self._covariances()
+        if not (np.abs(cov) < MAX_DISTANCE_M**2).all() or not (np.linalg.eigvalsh(cov) > 0).all():
+            raise MessageError("a covariance is not positive definite, or out of range")
+        distance = self._column("axis_distance")
+        if not (np.isnan(distance) | ((distance > 0) & (distance < MAX_DISTANCE_M))).all():
+            raise MessageError("a distance is out of range")
+
+    def _check_header(self) -> None:
+        if not (is_name(self.camera) and DIAMETERS_M[0] <= self.diameter_m <= DIAMETERS_M[1]):
+            raise MessageError("an invalid camera name, or an impossible diameter")
+        if not (0 <= self.t_ns < 2**63 and math.isfinite(self.exposure_us)):
+            raise MessageError("an impossible t_ns or exposure_us")
+        if self.clock_error_us < 0 or math.isinf(self.clock_error_us):
+            raise MessageError("an impossible clock_error_us")
+
+
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that a JPEG declares; None for anything else.
+
+    It is not decoded: a few kilobytes can declare an image of many gigabytes.
+    """
+    if not data.startswith(JPEG_START):
+        return None
+    at = len(JPEG_START)
+    while at + JPEG_SIZE_BYTES <= len(data) and data[at] == 0xFF:
+        if data[at + 1] in JPEG_SIZE_MARKERS:
+            height, width = (int.from_bytes(data[at + k : at + k + 2], "big") for k in (5, 7))
+            return (width, height) if width and height else None
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
 
 
 class Preview(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Opens Zenoh sessions with explicit endpoints: the server is a router that listens, other programs connect to it."""
+"""Opens Zenoh sessions with explicit endpoints: the server is a router that listens, other programs connect to it.
+
+`guarded` makes callbacks of Zenoh that never raise.
+"""
 
 import json
 import logging
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import zenoh
 
@@ -40,6 +44,7 @@ ALWAYS = {
 SEND_BUFFER = 8192  # bytes in the kernel: what a slow link can't carry is dropped here, before it is old
 LOOPBACK = re.compile(r"\w+/(localhost|127\.[\d.]+|\[::1\]):.*")  # never slow, and with segments of 64 kB
 BURST_BUFFER = 1 << 18  # for bursts of messages: a full buffer waits for an acknowledgement, 40 ms
+T = TypeVar("T")
 
 
 def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
@@ -259,3 +264,26 @@ class ServerWatch:
             log.warning("the server is back")
             self._reported = False
         self._since = time.monotonic()
+
+
+def guarded(
+    purpose: str, callback: Callable[[T], object], count_fault: Callable[[], object] = lambda: None
+) -> Callable[[T], None]:
+    """The callback, whose exceptions are logged and counted.
+
+    Of an exception Zenoh would print the traceback, and a query would wait for its timeout.
+
+    Args:
+        purpose: the subject of the log line, such as "a callback for poses".
+        callback: takes what Zenoh received.
+        count_fault: is called after an exception.
+    """
+
+    def call(received: T) -> None:
+        try:
+            callback(received)
+        except Exception:  # whatever a network can cause
+            count_fault()
+            log.exception("%s failed %s", purpose, getattr(received, "key_expr", ""))
+
+    return call

@@ -11,8 +11,8 @@ import tyro
 from camera_node.foundation.command_line import run_command
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.program import run
-from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
+from camera_node.simulation.simulated_camera import render_recording
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.pose import rotation_with_z
-from camera_node.simulation.background import Picture
+from camera_node.simulation.floor import Picture
 
 EDGE_ON = 0.02  # rad; discs seen at smaller angles are not drawn: they are less than half a pixel high
 CORNERS = np.linspace(0, math.tau, 12, endpoint=False)

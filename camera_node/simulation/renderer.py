@@ -16,8 +16,8 @@ import numpy as np
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
-from camera_node.simulation.background import Picture, paint_floor, plain_floor, view_floor
 from camera_node.simulation.discs import Disc, RollingDisc, discs_while_read, place_discs
+from camera_node.simulation.floor import Picture, paint_floor, plain_floor, view_floor
 from camera_node.simulation.scene import Scene, SceneCamera
 
 WHITE, BLACK = 215.0, 28.0  # grey levels of paper and print without vignetting

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Grey
-from camera_node.simulation.background import Picture
+from camera_node.simulation.floor import Picture
 
 WHITE = 255.0
 GAMMA = 1 / 2.2

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from camera_node.clocks.arrival_clock import ArrivalClock
+from camera_node.clocks.device_clock import ArrivalClock
 from camera_node.clocks.host_clock import unix_ahead_ns
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import CameraAbsentError, CameraError, ConfigError

@@ -11,8 +11,8 @@ from typing import Any
 from camera_node.foundation.errors import AddressError, RoundelError
 from camera_node.foundation.extras import require
 from camera_node.foundation.rate_limit import RateLimit
-from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import MessageError, Preview, decode
+from camera_node.protocol.session import guarded
 from camera_node.protocol.tcp_sockets import tcp_sockets
 from fusion.bridges.foxglove_channels import FoxgloveChannels
 from fusion.client.arena import Arena

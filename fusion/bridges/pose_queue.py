@@ -13,8 +13,7 @@ from typing import Annotated
 
 import tyro
 
-from camera_node.protocol.connection import ServerConnection
-from camera_node.protocol.server_address import ServerAddress
+from camera_node.protocol.server_connection import ServerAddress, ServerConnection
 from fusion.client.arena import Arena
 from fusion.client.streams import cause_of_silence
 from fusion.protocol.pose_messages import RobotPose

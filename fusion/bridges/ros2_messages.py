@@ -11,10 +11,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from camera_node.detection.relative import LocatedRoundels
+from camera_node.detection.roundels import LocatedRoundels
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
-from camera_node.protocol.relative import RelativePositions
+from camera_node.protocol.messages import RelativePositions
 from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.protocol.pose_messages import RobotPose
 

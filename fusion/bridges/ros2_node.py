@@ -20,7 +20,7 @@ import zenoh
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.logs import about
-from camera_node.protocol.relative import RelativePositions
+from camera_node.protocol.messages import RelativePositions
 from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, relative_poses, transforms
 from fusion.protocol.pose_messages import RobotPose
 

@@ -28,13 +28,10 @@ from calib.rig.messages import RigHistory, RigMessage
 from calib.rig.rig import Rig
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import NetworkError
-from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.connection import ServerConnection
-from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
-from camera_node.protocol.relative import RelativePositions
+from camera_node.protocol.messages import CameraStatus, Keys, MessageError, RelativePositions, decode
 from camera_node.protocol.requests import RETRY_S, RequestSource
-from camera_node.protocol.server_address import LOCAL
-from camera_node.protocol.session import ask_server
+from camera_node.protocol.server_connection import LOCAL, ServerConnection
+from camera_node.protocol.session import ask_server, guarded
 from fusion.client.streams import RelativeStream, RobotStream, Stream
 from fusion.model.robots import Robot as RobotBody
 from fusion.protocol.pose_messages import FusionStatus, Markers, RobotPose, RobotPoses, Robots, RobotsRequest

@@ -15,10 +15,9 @@ import zenoh
 
 from camera_node.foundation.config import is_name
 from camera_node.foundation.errors import NetworkError
-from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.connection import ServerConnection
-from camera_node.protocol.discovery import ALIVE
-from camera_node.protocol.relative import RelativePositions
+from camera_node.protocol.messages import RelativePositions
+from camera_node.protocol.server_connection import ALIVE, ServerConnection
+from camera_node.protocol.session import guarded
 from fusion.protocol.pose_messages import RobotPose
 from fusion.protocol.robot_requests import request_robots
 

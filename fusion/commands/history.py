@@ -12,8 +12,8 @@ import zenoh
 
 from calib.live.rig_requests import redo_rig, request_rig, request_rig_history, undo_rig
 from calib.rig.messages import RigMessage, RigVersion
+from camera_node.foundation.errors import printable
 from camera_node.foundation.terminal import say
-from camera_node.foundation.text import printable
 from camera_node.protocol.session import open_client
 from fusion.model.corrections import corrected_camera
 

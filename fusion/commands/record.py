@@ -9,7 +9,7 @@ import tyro
 from calib.rig.recording import RecordingWriter
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.recordings.arena_recording import ArenaRecorder
 from fusion.recordings.rotation import RotatingWriter, Rotation
 

@@ -12,8 +12,7 @@ import msgspec
 import numpy as np
 
 from camera_node.foundation.config import NAME_RULE, dump_yaml, is_name, load_yaml, write_atomically
-from camera_node.foundation.errors import ConfigError
-from camera_node.foundation.text import printable
+from camera_node.foundation.errors import ConfigError, printable
 from camera_node.geometry.body import Body
 from fusion.errors import FusionError
 from fusion.model.likeness import DISTINCT_M, likeness, sides, symmetry

@@ -5,8 +5,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from camera_node.foundation.errors import NetworkError
-from camera_node.foundation.text import printable
+from camera_node.foundation.errors import NetworkError, printable
 from camera_node.protocol.messages import MessageError, decode, encode
 from camera_node.protocol.requests import REQUEST_S, RequestError, RequestSource, send_request
 from fusion.errors import FusionError

@@ -20,8 +20,8 @@ from calib.rig.messages import RigMessage
 from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from camera_node.foundation.errors import ConfigError
-from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusedFrames, FusionStatus, RobotPose, Robots, robots_key

@@ -15,10 +15,9 @@ import zenoh
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.node.clock_sync import ClockSync
-from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.messages import encode
 from camera_node.protocol.requests import REQUEST_S, payload_of, respond
-from camera_node.protocol.session import has_assigned_port, open_client, open_router
+from camera_node.protocol.session import guarded, has_assigned_port, open_client, open_router
 from fusion.protocol.shards import Shard
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.fair_use import FrameQuotas, Preparation, Task, TaskQueue

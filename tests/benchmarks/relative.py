@@ -17,7 +17,8 @@ import numpy as np
 import tyro
 
 from camera_node.detection.detector import Detector
-from camera_node.detection.relative import DiscLocalizer, LocatedRoundels
+from camera_node.detection.relative import DiscLocalizer
+from camera_node.detection.roundels import LocatedRoundels
 from camera_node.geometry.lens import Lens
 from tests.camera_node.rendering import expose
 from tests.camera_node.tracing import Sight, pixels_across, trace

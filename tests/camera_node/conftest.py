@@ -7,7 +7,7 @@ import pytest
 import zenoh
 
 from camera_node.foundation.errors import NetworkError
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from camera_node.protocol.session import open_client, open_router
 from tests.conftest import free_port
 from tests.waiting import Inbox, poll

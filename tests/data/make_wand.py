@@ -12,8 +12,8 @@ import numpy as np
 
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.geometry.pose import Pose, invert
-from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
+from camera_node.simulation.simulated_camera import render_recording
 from camera_node.sources.recorded_detections import detect_frames
 
 SECONDS = 6.0

@@ -14,8 +14,8 @@ from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
-from camera_node.simulation.background import paint_floor
 from camera_node.simulation.discs import Disc, RollingDisc, discs_while_read, place_discs
+from camera_node.simulation.floor import paint_floor
 from camera_node.simulation.renderer import ImageModel
 from camera_node.simulation.scene import SceneCamera
 from tests.fusion.synthetic import Arena

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.rig.rig import Rig, save_rig
 from camera_node.detection.roundels import Roundels
-from camera_node.protocol.messages import COLUMNS, MAX_ROUNDELS, Detections, Keys, encode
+from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
@@ -97,7 +97,9 @@ class Flood:
 
     def __call__(self, message: Detections) -> Detections:
         false = next(self._columns)
-        return msgspec.structs.replace(message, **{c: getattr(message, c) + false[c] for c in COLUMNS})
+        return msgspec.structs.replace(
+            message, **{c: getattr(message, c) + false[c] for c in Detections.COLUMNS}
+        )
 
 
 def _false_columns(n: int, rng: np.random.Generator) -> dict[str, bytes]:

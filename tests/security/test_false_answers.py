@@ -12,8 +12,8 @@ from calib.live.rig_requests import request_rig
 from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
 from camera_node.node.clock_sync import ClockSync
-from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import ClockReply, encode
+from camera_node.protocol.server_connection import ServerConnection
 from camera_node.protocol.session import listening_endpoints, open_client, open_router
 from fusion.client.arena import Arena
 from fusion.protocol.pose_messages import Robots, robots_key

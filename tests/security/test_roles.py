@@ -12,7 +12,7 @@ import pytest
 from calib.live.rig_requests import set_rig, undo_rig
 from calib.rig.rig import Rig
 from camera_node.foundation.errors import NetworkError
-from camera_node.node.intrinsics import RigLens
+from camera_node.node.rig_lens import RigLens
 from camera_node.protocol.messages import Detections, Roundels, encode
 from camera_node.protocol.requests import RequestError
 from fusion.client.arena import Arena

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import drawing, loopback

@@ -12,8 +12,8 @@ from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.foundation.config import dump_yaml
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose
-from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.server.arena_config import ArenaConfig
 from tests.calib.synthetic import ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Page, TimeoutError
 
 from camera_node.foundation.errors import RoundelError
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.client.arena import Arena as Client
 from tests.fusion.serving import DEADLINE_S
 from tests.fusion.synthetic import WIDE

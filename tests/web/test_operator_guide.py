@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from camera_node.foundation.config import example_file
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from tests.conftest import ROOT
 from tests.web.browser import loopback
 from web.page import add_live_page

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Locator
 
 from camera_node.foundation.errors import ConfigError
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.commands.recordings import recordings
 from fusion.recordings.recording_files import list_recordings
 from tests.conftest import ROOT

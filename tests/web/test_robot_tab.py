@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page
 
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.client.arena import Arena as Client
 from fusion.model.robot_frame import turn_heading
 from fusion.model.robots import load_robots

@@ -22,7 +22,7 @@ from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
 from camera_node.foundation.errors import NetworkError
 from camera_node.foundation.supervisor import Supervisor, log_path
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from camera_node.protocol.session import CONNECT_S
 from camera_node.simulation.scene import Scene
 from camera_node.sources.frame import SourceSettings

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from camera_node.detection.relative import LocatedRoundels
+from camera_node.detection.roundels import LocatedRoundels
 from camera_node.foundation.arrays import Array
 from web.formation.estimator import RelativeEstimator
 from web.formation.planar import between, wrap

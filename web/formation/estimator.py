@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from camera_node.detection.relative import LocatedRoundels
+from camera_node.detection.roundels import LocatedRoundels
 from camera_node.foundation.arrays import Array
 from web.formation.planar import between, moved, wrap
 

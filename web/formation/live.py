@@ -11,7 +11,7 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.relative import DiscLocalizer
 from camera_node.foundation.errors import RoundelError
 from camera_node.node.node import Node, NodeOptions
-from camera_node.protocol.relative import RelativePositions
+from camera_node.protocol.messages import RelativePositions
 from camera_node.sources.frame import Frame, Source
 from fusion.client import Arena
 from web.formation.control import BLIND_S, Controller

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.relative import DiscLocalizer
-from camera_node.protocol.messages import decode, encode
-from camera_node.protocol.relative import RelativePositions
+from camera_node.protocol.messages import RelativePositions, decode, encode
 from web.formation.control import Controller
 from web.formation.formation import FormationScore, controllers, start_world
 from web.formation.vision import CAMERA, FPS, ROUNDEL, RobotCamera, paint_background

@@ -8,8 +8,8 @@ import numpy as np
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
-from camera_node.simulation.background import Picture, paint_floor
 from camera_node.simulation.discs import place_discs
+from camera_node.simulation.floor import Picture, paint_floor
 from camera_node.simulation.renderer import ImageModel
 from camera_node.simulation.scene import SceneCamera
 from web.formation.world import RobotWorld

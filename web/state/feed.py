@@ -14,9 +14,16 @@ import msgspec
 
 from calib.rig.messages import RigHistory, RigMessage
 from calib.rig.rig import Rig
-from camera_node.foundation.text import printable
-from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, Preview, decode
-from camera_node.protocol.relative import RelativePositions
+from camera_node.foundation.errors import printable
+from camera_node.protocol.messages import (
+    CameraStatus,
+    Detections,
+    Keys,
+    MessageError,
+    Preview,
+    RelativePositions,
+    decode,
+)
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusionStatus, Markers, RobotPose, Robots, robots_key
 from web.state.coverage_picture import CoveragePicture

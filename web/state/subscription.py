@@ -13,11 +13,11 @@ import zenoh
 from calib.live.rig_requests import redo_rig, request_rig_history, request_rig_message, undo_rig
 from camera_node.foundation.errors import RoundelError
 from camera_node.foundation.rate_limit import RateLimit
-from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import request_settings
-from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.requests import RequestSource
+from camera_node.protocol.server_connection import ServerConnection
+from camera_node.protocol.session import guarded
 from fusion.client.robot_definition import collect_markers
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusionStatus, Markers, Robots, RobotsRequest

@@ -7,7 +7,7 @@ import viser
 
 from calib.rig.messages import RigHistory, RigVersion
 from calib.rig.rig import Rig
-from camera_node.foundation.text import printable
+from camera_node.foundation.errors import printable
 from fusion.protocol.arena_health import assess_calibration, calibration_problems, describe_calibration
 from web.html_tables import Column, HtmlTable, TableRow, small
 from web.state.feed import ArenaState

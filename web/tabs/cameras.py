@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import NetworkError, RoundelError
-from camera_node.protocol.callbacks import guarded
 from camera_node.protocol.camera_requests import change_camera
 from camera_node.protocol.messages import Preview, Settings
 from camera_node.protocol.registration import CameraChange
 from camera_node.protocol.requests import RequestSource
+from camera_node.protocol.session import guarded
 from web.html_tables import MARGIN_PX
 from web.scene.cameras import CameraDrawing
 from web.state.coverage_picture import montage

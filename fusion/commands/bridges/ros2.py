@@ -5,7 +5,7 @@ import os
 
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from camera_node.protocol.session import BURST_BUFFER
 from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server, log_faults
 from fusion.bridges.ros2_node import Ros2Node, parse_domain, parse_namespace

@@ -12,9 +12,8 @@ from typing import Any
 import msgspec
 import zenoh
 
-from camera_node.foundation.errors import RoundelError
+from camera_node.foundation.errors import RoundelError, printable
 from camera_node.foundation.rate_limit import RateLimit
-from camera_node.foundation.text import printable
 from camera_node.protocol.requests import RequestSource, payload_of, sender_of
 
 log = logging.getLogger("fusion.audit")

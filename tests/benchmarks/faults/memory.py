@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.foundation.allocator import PERIOD_S
 from camera_node.foundation.arrays import Array
+from camera_node.foundation.program import PERIOD_S
 
 WARM_UP_S = 120.0  # of a life, which does not count: imports, caches and the allocator's arenas fill
 # Time of which the smallest value counts: a program returns freed memory only periodically.

@@ -11,7 +11,7 @@ from camera_node.detection.detector import Detector
 from camera_node.foundation.arrays import Array
 from camera_node.sensor_model import threshold
 from camera_node.sensor_model.imaging import Ground, Imaging
-from camera_node.simulation import background, renderer
+from camera_node.simulation import floor, renderer
 from tests.benchmarks.detector.pictures import Card, Grey, dead_leaves, expose, flat, grid, missed, paste
 from tests.benchmarks.detector.recall import blur_by_motion
 from tests.benchmarks.paper.report import Section, table
@@ -22,7 +22,7 @@ RECALL, NOISE, MIDDLE = 0.99, 3.0, 115.0
 FOCAL = 6000.0  # pixels; so long that no angle from the optical axis changes the ratio of the axes
 SMALLEST_PX, LARGEST_PX, STEP = 6.5, 48.0, 1.05
 # Of the even ground, between ink at 0 and paper at 1: the simulated arena's.
-FLOOR = (background.FLOOR - renderer.BLACK) / (renderer.WHITE - renderer.BLACK)
+FLOOR = (floor.FLOOR - renderer.BLACK) / (renderer.WHITE - renderer.BLACK)
 GROUNDS: tuple[Ground, ...] = ("cluttered", "even")
 MOTION_SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)
 MOTION_PX = (16, 20, 24, 32, 48)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from camera_node.detection.detector import Detector
-from camera_node.detection.relative import MAX_LOCATED, DiscLocalizer, LocatedRoundels
-from camera_node.detection.roundels import DetectedRoundels
+from camera_node.detection.relative import MAX_LOCATED, DiscLocalizer
+from camera_node.detection.roundels import DetectedRoundels, LocatedRoundels
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from tests.camera_node.rendering import expose

@@ -10,7 +10,7 @@ import pytest
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
 from camera_node.detection.sharpness import SECTORS, SIGMAS, edge_blur_px
-from camera_node.node.status import BLURRED_PX, advise_focus
+from camera_node.node.node_status import BLURRED_PX, advise_focus
 from tests.camera_node.rendering import Disc, expose, render
 
 STEP = SIGMAS[1] / SIGMAS[0]  # between two blurs that are tried

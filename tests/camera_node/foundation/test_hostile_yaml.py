@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.foundation.yaml_file import MAX_BYTES, MAX_DEPTH, MAX_VALUES
+from camera_node.foundation.config import MAX_BYTES, MAX_DEPTH, MAX_VALUES
 
 READ = """
 import resource, sys

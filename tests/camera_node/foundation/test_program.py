@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from camera_node.foundation.allocator import glibc
+from camera_node.foundation.program import glibc
 
 DEADLINE_S = 60.0
 
 RESIDENT = """
 import ctypes, os, threading, time
-from camera_node.foundation.allocator import glibc, return_freed_memory
+from camera_node.foundation.program import glibc, return_freed_memory
 from tests.benchmarks.faults.memory import anonymous_mb
 
 return_freed_memory(period_s=0.05)

@@ -9,8 +9,8 @@ from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.outline import centre_shifts, half_axes_of
 from camera_node.geometry.pose import look_at, rotation_from_vector
-from camera_node.simulation.background import plain_floor
 from camera_node.simulation.discs import place_discs
+from camera_node.simulation.floor import plain_floor
 from camera_node.simulation.renderer import ImageModel
 from camera_node.simulation.scene import SceneCamera
 

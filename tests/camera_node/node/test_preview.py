@@ -20,8 +20,15 @@ from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.node.node import Node
 from camera_node.node.preview import MAX_SHARE, PreviewPublisher, encode_preview
 from camera_node.protocol.camera_requests import mask_of, next_detections, request_settings
-from camera_node.protocol.jpeg import jpeg_size
-from camera_node.protocol.messages import MAX_PREVIEW_BYTES, Keys, MessageError, Preview, decode, encode
+from camera_node.protocol.messages import (
+    MAX_PREVIEW_BYTES,
+    Keys,
+    MessageError,
+    Preview,
+    decode,
+    encode,
+    jpeg_size,
+)
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.node.picture import CENTRE, render
 from tests.waiting import wait_for

@@ -7,7 +7,7 @@ import pytest
 
 from camera_node.detection.detector import Detector
 from camera_node.foundation.errors import ConfigError
-from camera_node.node.settings import apply_settings, read_settings
+from camera_node.node.node import apply_settings, read_settings
 from camera_node.protocol.messages import Settings
 from camera_node.sources.frame import SourceSettings
 from camera_node.sources.live import LiveSource

@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from camera_node.detection.relative import LocatedRoundels
-from camera_node.protocol.relative import RelativePositions
+from camera_node.detection.roundels import LocatedRoundels
+from camera_node.protocol.messages import RelativePositions
 
 HEADER = {"camera": "cam0", "seq": 3, "t_ns": 1_700_000_000_000_000_000, "diameter_m": 0.1}
 

@@ -13,7 +13,6 @@ from hypothesis.extra import numpy as hnp
 
 import calib.rig.messages
 import camera_node.protocol.messages
-import camera_node.protocol.relative
 import fusion.protocol.pose_messages
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import (
@@ -137,7 +136,6 @@ def test_every_field_is_documented():
     sections = (ROOT / "docs" / "messages.md").read_text().split("\n## ")
     for module in (
         camera_node.protocol.messages,
-        camera_node.protocol.relative,
         calib.rig.messages,
         fusion.protocol.pose_messages,
     ):
@@ -146,6 +144,7 @@ def test_every_field_is_documented():
                 isinstance(kind, type)
                 and issubclass(kind, msgspec.Struct)
                 and kind.__module__ == module.__name__
+                and kind.__struct_fields__  # otherwise it is a base class
             ):
                 section = next((s for s in sections if s.startswith(name + "\n")), None)
                 assert section, f"{name} has no section"

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from camera_node.geometry.pose import invert
-from camera_node.simulation.background import FLOOR
 from camera_node.simulation.discs import Disc, place_discs
+from camera_node.simulation.floor import FLOOR
 from camera_node.simulation.renderer import BLACK, WHITE, Renderer, covered_shares, vignette
 from camera_node.simulation.scene import Scene
 from camera_node.simulation.sensor import MILD

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.node.registration import camera_id
+from camera_node.node.server_registration import camera_id
 from camera_node.sources.drivers import identify
 from camera_node.sources.v4l2_cameras import device_key
 

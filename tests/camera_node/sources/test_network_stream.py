@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from camera_node.clocks.arrival_clock import LEAST_US, UNKNOWN_US, ArrivalClock
+from camera_node.clocks.device_clock import LEAST_US, UNKNOWN_US, ArrivalClock
 from camera_node.commands.publish import open_source
 from camera_node.foundation.errors import CameraAbsentError, ConfigError
 from camera_node.sources.frame import SourceSettings

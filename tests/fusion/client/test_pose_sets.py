@@ -3,7 +3,7 @@
 
 import pytest
 
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.client.arena import Arena
 from tests.conftest import free_port
 from tests.fusion.bridges.pose_server import ARENA, PoseServer

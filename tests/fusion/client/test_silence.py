@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from camera_node.foundation.errors import NetworkError
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.client.streams import RobotStream, cause_of_silence
 from tests.conftest import free_port
 from tests.fusion.serving import config, serving

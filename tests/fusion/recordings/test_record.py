@@ -13,8 +13,8 @@ from calib.rig.messages import RigMessage
 from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig
 from camera_node.foundation.errors import ConfigError
-from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.model.limits import Limits

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.foundation.allocator import glibc
+from camera_node.foundation.program import glibc
 from camera_node.protocol.session import open_client
 from fusion.server.server import Server
 from tests.fusion.serving import KEYS, config, serving

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from camera_node.detection.relative import LocatedRoundels
+from camera_node.detection.roundels import LocatedRoundels
 from tests.conftest import free_port
 from web.formation.control import BLIND_S, DISTANCE_M, Follower, Leader, place_of
 from web.formation.estimator import RelativeEstimator

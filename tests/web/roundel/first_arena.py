@@ -29,8 +29,8 @@ from playwright.sync_api import Locator, Page, expect, sync_playwright
 from calib.rig.rig import load_rig
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.foundation.config import example_file
-from camera_node.simulation.recording import render_recording
 from camera_node.simulation.scene import Scene
+from camera_node.simulation.simulated_camera import render_recording
 from camera_node.sources.recorded_frames import read_grey
 from tests.benchmarks.faults.network import Loopback
 from tests.conftest import free_port

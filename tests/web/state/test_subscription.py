@@ -8,8 +8,8 @@ import zenoh
 from calib.rig.messages import RigMessage, undo_rig_key
 from calib.rig.rig import Rig
 from camera_node.foundation.errors import NetworkError, RoundelError
-from camera_node.protocol.connection import ServerConnection
 from camera_node.protocol.messages import encode
+from camera_node.protocol.server_connection import ServerConnection
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.state.feed import Feed

@@ -3,17 +3,17 @@
 
 import logging
 from collections.abc import Callable
+from typing import ClassVar
 
+import msgspec
 import zenoh
 
 from camera_node.detection.known_lens import KnownLens
 from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
-from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.intrinsics import RigLenses
-from camera_node.protocol.messages import Keys, MessageError, decode
-from camera_node.protocol.session import is_from_router
+from camera_node.protocol.messages import VERSION, Keys, MessageError, decode
+from camera_node.protocol.session import guarded, is_from_router
 
 log = logging.getLogger("camera_node")
 
@@ -114,3 +114,16 @@ class RigLens:
             self._on_refusal()
         except ConfigError as error:
             log.warning("the lens of %s in the rig is not used: %s", self._camera, error)
+
+
+class RigLenses(msgspec.Struct, frozen=True, kw_only=True):
+    """The lenses in a `RigMessage`, which `calib` defines and the server publishes; other fields are skipped."""
+
+    class Cameras(msgspec.Struct, frozen=True):
+        """The part of a rig."""
+
+        cameras: dict[str, Lens]
+
+    MAX_BYTES: ClassVar[int] = 1 << 20  # that of a `RigMessage`
+    version: int = VERSION
+    rig: Cameras

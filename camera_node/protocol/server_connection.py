@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A connection to the server that is opened in the background, for programs that start before the server."""
+"""How programs reach the server of an arena: by its address or by scouting, and also before the server starts."""
 
 import logging
 import threading
@@ -7,18 +7,23 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
+from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
 
 from camera_node.foundation.errors import ConfigError, NetworkError
-from camera_node.protocol.callbacks import guarded
-from camera_node.protocol.session import NO_SERVER, PATIENCE_S, open_endless
+from camera_node.protocol.session import NO_SERVER, PATIENCE_S, guarded, open_client, open_endless
 
 log = logging.getLogger("camera_node.network")
 
 FIRST_S = 0.5  # in which the session opens if the server runs, and invalid endpoints are found
 WAIT_S = 0.2  # between two looks at whether a session is open
+LOCAL = ("tcp/127.0.0.1:7447",)
+SCOUT_S = 1.5  # scouting repeats its question after 1 s
+CONNECT_S = 2.0  # to one router that was found
+MAX_ROUTERS = 16
+ALIVE = "*/fusion/alive"
 
 
 class ServerConnection:
@@ -150,3 +155,66 @@ class _Absence:
     def end(self) -> None:
         if self._is_reported:
             log.warning("the server is back")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerAddress:
+    """The arena's server."""
+
+    connect: tuple[str, ...] = LOCAL
+    """Zenoh endpoints of the server."""
+    arena: str = "arena"
+    """The arena's name."""
+    zenoh: Path | None = None
+    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundArena:
+    """An arena, and the endpoints at which its server is reached."""
+
+    arena: str
+    endpoints: tuple[str, ...]
+
+
+def find_arenas(timeout_s: float = SCOUT_S) -> list[FoundArena]:
+    """The arenas whose servers answer multicast scouting; other Zenoh routers are left out."""
+    found = []
+    for endpoints in _scout(timeout_s):
+        try:
+            with open_client(endpoints, timeout_s=CONNECT_S) as session:
+                replies = session.liveliness().get(ALIVE, timeout=CONNECT_S)
+                tokens = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        except (NetworkError, zenoh.ZError):
+            continue
+        found += [FoundArena(token.partition("/")[0], endpoints) for token in sorted(tokens)]
+    return found
+
+
+def choose_arena(found: Sequence[FoundArena], arena: str | None) -> FoundArena | None:
+    """The arena of that name, or the only one; None if there is none.
+
+    Raises:
+        ConfigError: there are several, and no name chooses one.
+    """
+    matching = [each for each in found if arena in (None, each.arena)]
+    if len(matching) > 1:
+        names = ", ".join(f"{each.arena} at {each.endpoints[0]}" for each in matching)
+        raise ConfigError(f"several arenas are in this network: {names}; choose with --arena or --connect")
+    return matching[0] if matching else None
+
+
+def _scout(timeout_s: float) -> list[tuple[str, ...]]:
+    """The endpoints of each router that answers."""
+    config = zenoh.Config()
+    config.insert_json5("scouting/multicast/enabled", "true")
+    routers: dict[str, tuple[str, ...]] = {}
+
+    def receive(hello: zenoh.Hello) -> None:
+        if len(routers) < MAX_ROUTERS:
+            routers[str(hello.zid)] = tuple(hello.locators)
+
+    scout = zenoh.scout(receive, what="router", config=config)
+    threading.Event().wait(timeout_s)
+    scout.stop()
+    return [endpoints for endpoints in routers.values() if endpoints]

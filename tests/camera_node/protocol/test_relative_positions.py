@@ -9,8 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.protocol.messages import MessageError, decode, encode
-from camera_node.protocol.relative import COLUMNS, MAX_POSITIONS, RelativePositions
+from camera_node.protocol.messages import (
+    MAX_POSITIONS,
+    MessageError,
+    RelativePositions,
+    decode,
+    encode,
+)
 from tests.camera_node.protocol.positions import HEADER, pack_random, random_positions
 
 GOOD = pack_random(2)
@@ -34,7 +39,7 @@ def symmetric(cov: np.ndarray) -> np.ndarray:
     return np.triu(cov) + np.triu(cov, 1).mT
 
 
-@pytest.mark.parametrize("column", COLUMNS)
+@pytest.mark.parametrize("column", RelativePositions.COLUMNS)
 def test_columns_of_other_lengths_are_refused(column: str):
     longer = msgspec.structs.replace(GOOD, **{column: getattr(GOOD, column) + b"\0"})
     with pytest.raises(MessageError):
@@ -42,7 +47,7 @@ def test_columns_of_other_lengths_are_refused(column: str):
 
 
 def changed(name: str, row: int, value: float) -> dict[str, bytes]:
-    dtype, width = COLUMNS[name]
+    dtype, width = RelativePositions.COLUMNS[name]
     column = np.frombuffer(getattr(GOOD, name), dtype).copy()
     column[row * width] = value
     return {name: column.tobytes()}

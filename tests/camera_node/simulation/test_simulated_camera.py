@@ -15,10 +15,9 @@ import pytest
 import yaml
 
 from camera_node.geometry.pose import Pose
-from camera_node.simulation.camera import SimulatedCamera
-from camera_node.simulation.recording import render_recording
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import Scene
+from camera_node.simulation.simulated_camera import SimulatedCamera, render_recording
 from camera_node.sources.recorded_frames import FrameFolder, read_grey
 from tests.camera_node.scenes import CAMERA, DISC, write_scene
 from tests.conftest import ROOT

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from camera_node.node.status import FULL, advise
+from camera_node.node.node_status import FULL, advise
 from tests.camera_node.rendering import Disc, expose, render
 
 NONE = np.empty((0, 2))

@@ -14,8 +14,8 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.known_lens import KnownLens
 from camera_node.detection.roundels import DetectedRoundels
 from camera_node.foundation.arrays import Grey
-from camera_node.node.intrinsics import RigLens
 from camera_node.node.node import Node
+from camera_node.node.rig_lens import RigLens
 from camera_node.protocol.messages import Detections, Keys, decode, encode
 from camera_node.sources.frame import Frame, Source
 from tests.camera_node.tracing import Sight, trace

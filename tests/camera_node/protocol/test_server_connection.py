@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from camera_node.foundation.errors import ConfigError, NetworkError
-from camera_node.protocol.connection import ServerConnection
+from camera_node.protocol.server_connection import ServerConnection
 
 
 def test_actions_wait_for_the_server_and_then_run_at_once(network):
@@ -47,7 +47,7 @@ def test_the_wait_ends_with_the_stop_event_or_with_an_exception(network):
 
 
 def test_the_absence_of_the_server_is_logged_once(network, caplog, monkeypatch):
-    monkeypatch.setattr("camera_node.protocol.connection.PATIENCE_S", 0.0)
+    monkeypatch.setattr("camera_node.protocol.server_connection.PATIENCE_S", 0.0)
     caplog.set_level(logging.WARNING, "camera_node.network")
     looks = 0
 

@@ -4,17 +4,16 @@
 import math
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from camera_node.detection.detector import Detector
-from camera_node.detection.roundels import DetectedRoundels, Roundels
+from camera_node.detection.roundels import DetectedRoundels
 from camera_node.detection.sharpness import edge_blur_px
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.protocol.messages import CameraStatus
-from camera_node.sources.frame import Frame, Source
+from camera_node.sources.frame import Source
 
 THERMAL = Path("/sys/class/thermal")
 FULL = 250  # grey levels from which a pixel counts as saturated
@@ -28,26 +27,16 @@ BLURRED_PX = 1.4  # of edges; a camera in focus has 0.4 to 1, and beyond 1.4 sma
 NO_IMAGE, NO_CENTRES = np.empty((0, 0), np.uint8), np.empty((0, 2))
 
 
-@dataclass(frozen=True, slots=True)
-class DetectedFrame:
-    """A frame, its roundels as measured and as published, and the duration of their detection in microseconds."""
-
-    frame: Frame
-    roundels: DetectedRoundels
-    published: Roundels  # with the camera's lens, if it is known
-    detect_us: float
-
-
 class NodeStatistics:
     """Counts frames and refused requests, and summarizes them once per second. Safe to use from several threads.
 
     Attributes:
-        latest: the last counted frame; None before the first.
+        latest: the image and the roundels of the last counted frame; None before the first.
     """
 
     def __init__(self, camera: str) -> None:
         self.camera = camera
-        self.latest: DetectedFrame | None = None
+        self.latest: tuple[Grey, DetectedRoundels] | None = None
         self._lock = threading.Lock()
         self._frames = self._refused = 0
         self._clear()
@@ -57,14 +46,14 @@ class NodeStatistics:
         self._recent = self._roundels = 0
         self._detect_us = 0.0
 
-    def count(self, detected: DetectedFrame) -> None:
-        """Count a published frame."""
+    def count(self, image: Grey, roundels: DetectedRoundels, detect_us: float) -> None:
+        """Count a published frame: its roundels as measured, and the duration of their detection."""
         with self._lock:
             self._frames += 1
             self._recent += 1
-            self._roundels += len(detected.roundels)
-            self._detect_us += detected.detect_us
-            self.latest = detected
+            self._roundels += len(roundels)
+            self._detect_us += detect_us
+            self.latest = image, roundels
 
     def count_refusal(self) -> None:
         """Count a refused request, or a refused message of the server."""
@@ -83,8 +72,8 @@ class NodeStatistics:
             detector: the detector in use, for what it has learned.
         """
         latest = self.latest
-        image, uv = (latest.frame.image, latest.roundels.uv) if latest else (NO_IMAGE, NO_CENTRES)
-        blur_px = edge_blur_px(image, latest.roundels) if latest else None
+        image, uv = (latest[0], latest[1].uv) if latest else (NO_IMAGE, NO_CENTRES)
+        blur_px = edge_blur_px(*latest) if latest else None
         advice = advise(image, uv) or advise_focus(blur_px)
         with self._lock:  # which frames wait for
             n = max(1, self._recent)

@@ -15,9 +15,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from camera_node.foundation.errors import NetworkError, RoundelError
-from camera_node.node.node import Node
-from camera_node.protocol.callbacks import guarded
+from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, Settings, decode, encode
 from camera_node.protocol.registration import (
     CameraAssignment,
@@ -28,6 +26,7 @@ from camera_node.protocol.registration import (
     register_key,
 )
 from camera_node.protocol.requests import RequestError, RequestSource, send_request
+from camera_node.protocol.session import guarded
 
 log = logging.getLogger("camera_node.registration")
 
@@ -150,7 +149,7 @@ class Registration:
         if (
             before is None
             or before.name != assignment.name
-            or _set(assignment.settings) != _set(before.settings)
+            or set_fields(assignment.settings) != set_fields(before.settings)
         ):
             self._on_change(assignment)
 
@@ -172,51 +171,6 @@ class Registration:
                 log.exception("a change of name or settings failed")
 
 
-def _set(settings: Settings) -> dict[str, Any]:
+def set_fields(settings: Settings) -> dict[str, Any]:
     """The settings that are set."""
     return {name: value for name, value in msgspec.structs.asdict(settings).items() if value is not None}
-
-
-class RegisteredNode:
-    """Runs a node under its name and with its settings, and applies the changes of both."""
-
-    def __init__(self, registration: Registration) -> None:
-        self._registration = registration
-        self._node: Node | None = None
-        self._next: CameraAssignment | None = None
-        registration.follow(self._change)
-
-    def run(self, node: Node, assignment: CameraAssignment) -> CameraAssignment | None:
-        """Run a node until it ends.
-
-        Returns:
-            The assignment with its new name if it was renamed; None if its source ended.
-        """
-        self._node, self._next = node, None
-        node.on_settings = self._registration.store
-        self._apply(node, assignment.settings)
-        if (latest := self._registration.assigned) is not None and latest.name != node.name:
-            return latest  # renamed before it ran
-        node.run()
-        return self._next
-
-    def _change(self, assignment: CameraAssignment) -> None:
-        node = self._node
-        if node is None:
-            return
-        if assignment.name != node.name:
-            log.warning("camera %s is now called %s", node.name, assignment.name)
-            self._next = assignment
-            node.close()
-        else:
-            self._apply(node, assignment.settings)
-
-    def _apply(self, node: Node, settings: Settings) -> None:
-        """Apply the stored settings one by one: those that the source does not have must not prevent the others."""
-        for name, value in _set(settings).items():
-            if name == "version":
-                continue
-            try:
-                node.adjust(Settings(**{name: value}))
-            except RoundelError as error:
-                log.warning("the stored setting %s of %s is not used: %s", name, node.name, error)
