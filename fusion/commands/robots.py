@@ -13,8 +13,7 @@ from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import open_client
 from fusion.client.robot_definition import LOST_AT_RESTART
-from fusion.model.robot_frame import move_origin, turn_heading
-from fusion.model.robots import Robot, save_robots
+from fusion.model.robots import Robot, move_origin, save_robots, turn_heading
 from fusion.protocol.pose_messages import Robots, RobotsRequest
 from fusion.protocol.robot_requests import change_robots, reframe_robot, request_robots
 

@@ -1,22 +1,164 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Tables of the detections of a frame set, of the markers of all robots, and of the assignments between them."""
+"""The cameras of a rig, the discs of all robots, and the detections of a frame set, as columns.
+
+`native/disc_view.hpp` states the projection of a disc, `native/linearization.cpp` its derivatives. All of it works in
+the undistorted image plane x/z, y/z; `CalibratedFrame.measure` undistorts each detection once, on arrival. Arrays store
+columns: (3, N) for N vectors.
+"""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.columns import Columns
 from camera_node.geometry.outline import half_axes_of
 from fusion import _core
-from fusion.model.camera_array import CameraArray, Discs, Exposures, take_columns
+from fusion._core import SLACK_PX
 from fusion.model.frames import FrameSet
 from fusion.model.robots import Robot
 from fusion.model.states import States
+from fusion.model.undistortion import table_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DetectionTable:
+class Exposures:
+    """F frames.
+
+    Attributes:
+        camera: (F,) index of the camera.
+        tau: (F,) capture time minus the time of the states, seconds.
+        tau_sigma: (F,) its standard deviation by the clock, seconds.
+        line_s: (F,) time from one row to the next of a rolling shutter, seconds.
+    """
+
+    camera: Index
+    tau: Array
+    tau_sigma: Array
+    line_s: Array
+
+    @classmethod
+    def exact(cls, camera: Index, tau: Array) -> "Exposures":
+        """Frames of exactly known time."""
+        return cls(camera, tau, *np.zeros((2, len(tau))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Discs(Columns):
+    """N discs, each in one frame and on one body.
+
+    Attributes:
+        frame: (N,) row of the exposures.
+        body: (N,) row of the states.
+        marker: (N,) row of the marker table; identifies the marker.
+        position, normal: (3, N) centre, and unit normal out of the print; body frame.
+        radius: (N,) of the black disc, metres.
+        delay: (N,) time from the frame to the capture of the disc's row by a rolling shutter, seconds; None for 0.
+    """
+
+    ROW_AXIS: ClassVar[int] = -1
+
+    frame: Index
+    body: Index
+    marker: Index
+    position: Array
+    normal: Array
+    radius: Array
+    delay: Array | None = None
+
+    @property
+    def columns(self) -> _core.DiscColumns:
+        """The arrays for the native core."""
+        delay = np.zeros(len(self)) if self.delay is None else self.delay
+        return _core.DiscColumns(self.frame, self.body, self.position, self.normal, self.radius, delay)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """N projected discs.
+
+    Attributes:
+        centre, normal: (3, N) of the disc, camera frame.
+        q: (3, N) point that projects to the centre of the outline, camera frame.
+        xy: (2, N) centre of the outline, undistorted; NaN where the disc is behind the camera.
+    """
+
+    centre: Array
+    normal: Array
+    q: Array
+    xy: Array
+
+    @property
+    def facing(self) -> Array:
+        """(N,) cosine between the normal and the direction to the camera: positive where the print is visible."""
+        along = np.einsum("in,in->n", self.normal, self.centre)
+        return -along / np.sqrt(np.einsum("in,in->n", self.centre, self.centre))
+
+
+class CameraArray:
+    """The placed cameras of a rig, by index in the order of `names`.
+
+    Attributes:
+        R_cam_world: (C, 3, 3).
+        centres: (C, 3) centres of projection, world frame.
+        focal: (C,) mean focal lengths, pixels.
+        revision: counts the changes of camera poses.
+    """
+
+    def __init__(self, cameras: dict[str, Camera]) -> None:
+        self.names = tuple(cameras)
+        self.index = {name: k for k, name in enumerate(cameras)}
+        self._cameras = dict(cameras)
+        self.revision = 0
+        for camera in cameras.values():
+            table_of(camera)  # so that the first frame does not wait for it
+        self._update()
+
+    def __getitem__(self, name: str) -> Camera:
+        return self._cameras[name]
+
+    def as_dict(self) -> dict[str, Camera]:
+        """A copy of all cameras by name."""
+        return dict(self._cameras)
+
+    def place(self, name: str, camera: Camera) -> None:
+        """Replace the pose of a camera."""
+        self._cameras[name] = camera
+        self.revision += 1
+        self._update()
+
+    def _update(self) -> None:
+        cameras = self._cameras.values()
+        T = np.array([camera.matrix() for camera in cameras]).reshape(-1, 4, 4)
+        self.R_cam_world = np.ascontiguousarray(T[:, :3, :3].transpose(0, 2, 1))
+        self.centres = np.ascontiguousarray(T[:, :3, 3])
+        self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
+
+    def frame_poses(self, states: States, exposures: Exposures) -> _core.FramePoses:
+        """The poses of all bodies at the capture times of all frames."""
+        k = exposures.camera
+        cameras = _core.CameraExposures(
+            self.R_cam_world[k], self.centres[k], exposures.tau, exposures.tau_sigma
+        )
+        return _core.FramePoses(states.bodies, cameras)
+
+    def views(self, states: States, exposures: Exposures, discs: Discs) -> Views:
+        """Project discs at the capture times of their frames."""
+        rows = self.frame_poses(states, exposures).views(discs.columns)
+        return Views(rows[:3], rows[3:6], rows[6:9], rows[9:])
+
+    def rays(self, camera: Index, xy: Array) -> Array:
+        """Unit viewing rays (N, 3), world frame, of undistorted xy (2, N)."""
+        rays = np.column_stack([*xy, np.ones(len(camera))])
+        rays /= np.sqrt(np.einsum("ni,ni->n", rays, rays))[:, None]
+        return np.einsum("nij,ni->nj", self.R_cam_world[camera], rays)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectionTable(Columns):
     """All N detections of a frame set, by columns.
 
     Attributes:
@@ -29,6 +171,9 @@ class DetectionTable:
         scale: (2, 2, N) Jacobians of raw pixels with respect to xy.
     """
 
+    ROW_AXIS: ClassVar[int] = -1
+    SHARED: ClassVar[frozenset[str]] = frozenset({"exposures"})
+
     exposures: Exposures
     frame: Index
     delay: Array
@@ -38,9 +183,6 @@ class DetectionTable:
     angle_rad: Array
     xy: Array
     scale: Array
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
     @property
     def camera(self) -> Index:
@@ -56,11 +198,6 @@ class DetectionTable:
     def columns(self) -> _core.DetectionColumns:
         """The arrays for the native core."""
         return _core.DetectionColumns(self.frame, self.xy, self.scale, self.cov, self.axes_px[0], self.delay)
-
-    def select(self, rows: NDArray) -> "DetectionTable":
-        """The columns of a mask or an index array."""
-        arrays = self.frame, self.delay, self.uv, self.cov, self.axes_px, self.angle_rad, self.xy, self.scale
-        return DetectionTable(self.exposures, *take_columns(rows, *arrays))
 
     def conics(self) -> Array:
         """(N, 3, 3) conics Q of outlines, p^T Q p = 0 for undistorted p = (x, y, 1); NaN where the axes are unknown.
@@ -104,7 +241,7 @@ def _concatenate(columns: list[Array], empty: tuple[int, ...]) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MarkerTable:
+class MarkerTable(Columns):
     """All K markers of all robots.
 
     Attributes:
@@ -114,6 +251,9 @@ class MarkerTable:
         radius: (K,) of the black disc, metres.
         first: (R + 1,): robot r has the rows first[r] to first[r + 1].
     """
+
+    ROW_AXIS: ClassVar[int] = -1
+    SHARED: ClassVar[frozenset[str]] = frozenset({"first"})
 
     robot: Index
     number: Index
@@ -135,26 +275,23 @@ class MarkerTable:
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
 
-    def __len__(self) -> int:
-        return len(self.robot)
-
     def discs(self, rows: Index, frame: Index) -> Discs:
         """The markers `rows`, each in one frame."""
-        position, normal = take_columns(rows, self.position, self.normal)
-        return Discs(frame, self.robot[rows], rows, position, normal, self.radius[rows])
+        of = self.select(rows)
+        return Discs(frame, of.robot, rows, of.position, of.normal, of.radius)
 
     def expected(self, rows: Index, states: States, body: Index | None = None) -> _core.ExpectedMarkers:
         """The markers `rows` with the covariances of their positions; `body` is the row of the states of each.
 
         Without `body`, the rows of the states are those of the robots.
         """
-        body = self.robot[rows] if body is None else body
-        position, normal = take_columns(rows, self.position, self.normal)
-        return _core.ExpectedMarkers(states.R, states.P, body, position, normal, self.radius[rows])
+        of = self.select(rows)
+        body = of.robot if body is None else body
+        return _core.ExpectedMarkers(states.R, states.P, body, of.position, of.normal, of.radius)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Assignments:
+class Assignments(Columns):
     """Rows of the detection table, the rows of the marker table that they belong to, and squared residuals, px^2.
 
     The residuals are NaN before the estimate.
@@ -174,26 +311,16 @@ class Assignments:
         """No assignment."""
         return cls.of(np.empty(0, np.intp), np.empty(0, np.intp))
 
-    def __len__(self) -> int:
-        return len(self.detection)
-
     def with_residuals(self, residuals_px: Array) -> "Assignments":
         """The same with residuals (2, N)."""
         return Assignments(self.detection, self.marker, np.sum(residuals_px**2, 0))
 
-    def select(self, rows: NDArray) -> "Assignments":
-        """The rows of a mask or an index array."""
-        return Assignments(self.detection[rows], self.marker[rows], self.squared_px[rows])
-
-    def joined(self, *others: "Assignments") -> "Assignments":
-        """These assignments, then the others."""
-        parts = (self, *others)
-        return Assignments(*(np.concatenate([getattr(part, k) for part in parts]) for k in self.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MatchedObservations:
+class MatchedObservations(Columns):
     """N detections and their discs. `whiten` (2, 2, N) scales errors in xy to unit covariance."""
+
+    ROW_AXIS: ClassVar[int] = -1
 
     discs: Discs
     detections: DetectionTable
@@ -212,14 +339,12 @@ class MatchedObservations:
         """Detections of known discs, row by row, each captured when the detection was."""
         return cls(replace(discs, delay=detections.delay), detections, _whiten(detections))
 
-    def __len__(self) -> int:
-        return len(self.discs)
-
-    def select(self, rows: NDArray) -> "MatchedObservations":
-        """The observations of a mask or an index array."""
-        return MatchedObservations(
-            self.discs.select(rows), self.detections.select(rows), self.whiten[:, :, rows]
-        )
+    def misfit(self, residuals_px: Array) -> Array:
+        """(N,) squares of residuals (2, N) in standard deviations, including `SLACK_PX`; infinite where these are NaN:
+        the disc is not visible."""
+        cov = self.detections.cov
+        d2 = np.sum(residuals_px**2, 0) / ((cov[0, 0] + cov[1, 1]) / 2 + SLACK_PX**2)
+        return np.nan_to_num(d2, nan=np.inf)
 
 
 def _whiten(detections: DetectionTable) -> Array:
@@ -229,3 +354,8 @@ def _whiten(detections: DetectionTable) -> Array:
     c = np.sqrt(detections.cov[1, 1] - b * b)
     first = detections.scale[0] / a
     return np.stack([first, (detections.scale[1] - b * first) / c])
+
+
+def mean_by_body(values: NDArray, body: Index, n_bodies: int) -> Array:
+    """(B,) means of values (N,) of the bodies (N,); 0 for bodies without values."""
+    return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Robots declared in `robots.yaml`; refuses symmetric constellations and robots that look alike."""
+"""Robots declared in `robots.yaml`: checked, saved and changed.
+
+Symmetric constellations and robots that look alike are refused. A robot's own frame can have another origin (pivot), or
+another direction of its x axis (heading).
+"""
 
 import math
 from collections import Counter
@@ -11,6 +15,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import NAME_RULE, dump_yaml, is_name, load_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError, printable
 from camera_node.geometry.body import Body
@@ -25,6 +30,8 @@ BACK_COS = 0.5  # between normals, below which discs are on different faces and 
 # Of the diameter, between discs on different faces: acquisition takes closer ones for one marker.
 BACK_SHARE = 0.6
 MAX_ROBOTS, MAX_ALL_MARKERS = 256, 1024  # of one arena: more than one process follows, or two
+MAX_PIVOT_M = 5.0
+DECIMALS = 5  # of marker positions in a changed frame: hundredths of a millimetre
 MANOEUVRE_S = 0.1  # duration of an acceleration; converts accelerations to densities of white noise
 
 
@@ -225,3 +232,36 @@ def _lack_of_starts(a: Robot, b: Robot, remedy: str) -> str | None:
     if a.start_m and b.start_m and math.dist(a.start_m, b.start_m) >= APART_M:
         return None
     return f"identical: give both a start_m, {APART_M:g} m or more apart, or {remedy}"
+
+
+def move_origin(robot: Robot, pivot_m: tuple[float, float, float]) -> Robot:
+    """The robot with its origin at `pivot_m`, a point of its present frame, metres.
+
+    Raises:
+        FusionError: the point is not finite, or too far away.
+    """
+    if not all(abs(x) <= MAX_PIVOT_M for x in pivot_m):  # False for NaN
+        raise FusionError(
+            f"the pivot {pivot_m} is out of range; give metres, within {MAX_PIVOT_M:g} m of the robot"
+        )
+    return _with_markers(robot, robot.points - np.array(pivot_m), robot.unit_normals)
+
+
+def turn_heading(robot: Robot, degrees: float) -> Robot:
+    """The robot with its x axis turned about its z axis by `degrees`, counterclockwise seen from above.
+
+    Raises:
+        FusionError: the angle is not finite.
+    """
+    if not math.isfinite(degrees):
+        raise FusionError(f"the angle {degrees} is no number of degrees")
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    R_old_new = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return _with_markers(robot, robot.points @ R_old_new, robot.unit_normals @ R_old_new)
+
+
+def _with_markers(robot: Robot, points: Array, normals: Array) -> Robot:
+    markers, directions = (
+        tuple(map(tuple, (np.round(rows, DECIMALS) + 0.0).tolist())) for rows in (points, normals)
+    )
+    return msgspec.structs.replace(robot, markers=markers, normals=directions)

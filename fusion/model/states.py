@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Mask
+from camera_node.foundation.columns import Columns
 from camera_node.geometry.pose import rotation_from_vector, vector_from_rotation
 from fusion import _core
 
@@ -21,7 +22,7 @@ UNKNOWN_RATE = 10.0**2  # variance of an unobservable angular velocity, rad^2/s^
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class States:
+class States(Columns):
     """N bodies: R (N, 3, 3), p, omega and v (N, 3), all world frame; P (N, 12, 12)."""
 
     R: Array
@@ -37,21 +38,10 @@ class States:
         P = np.tile(np.diag(np.repeat(np.square(sigmas), 3)), (n, 1, 1))
         return cls(R.copy(), p.copy(), np.zeros((n, 3)), np.zeros((n, 3)), P)
 
-    def __len__(self) -> int:
-        return len(self.p)
-
     @property
     def bodies(self) -> _core.BodyStates:
         """Poses and velocities for the native core."""
         return _core.BodyStates(self.R, self.p, self.omega, self.v)
-
-    def select(self, rows: NDArray) -> "States":
-        """The rows of a mask or an index array."""
-        return States(self.R[rows], self.p[rows], self.omega[rows], self.v[rows], self.P[rows])
-
-    def joined(self, other: "States") -> "States":
-        """These bodies, then the others."""
-        return States(*(np.concatenate([getattr(s, k) for s in (self, other)]) for k in self.__slots__))
 
     def with_rows(self, rows: NDArray, other: "States") -> "States":
         """A copy in which `other` replaces these rows."""
@@ -77,7 +67,7 @@ class States:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Transition:
+class Transition(Columns):
     """The transition matrices F of the errors of N bodies, by their off-diagonal blocks.
 
     Attributes:
@@ -94,10 +84,6 @@ class Transition:
         moved[:, THETA] += self.T @ errors[:, OMEGA]
         moved[:, POSITION] += self.dt[:, None, None] * errors[:, VELOCITY]
         return moved
-
-    def select(self, rows: NDArray) -> "Transition":
-        """The rows of a mask or an index array."""
-        return Transition(self.T[rows], self.dt[rows])
 
 
 def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[States, Transition]:

@@ -3,9 +3,8 @@
 
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Mask
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.monitoring.clocks.camera_clocks import CameraClocks
 from fusion.monitoring.clocks.time_search import Snapshot
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, ExtrinsicsMonitor, TrackedScene

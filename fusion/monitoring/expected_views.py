@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
-from fusion.model.camera_array import CameraArray, Exposures
-from fusion.model.observations import MarkerTable
+from fusion.model.observations import CameraArray, Exposures, MarkerTable
 from fusion.model.states import States
 
 MIN_FACING, MARGIN_PX = 0.35, 30.0  # of markers that a camera is certain to see

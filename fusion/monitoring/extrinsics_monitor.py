@@ -18,9 +18,8 @@ import numpy as np
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Mask
 from camera_node.geometry.pose import Pose
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.observations import MarkerTable
+from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import States
 from fusion.monitoring.expected_views import ExpectedViews
 from fusion.monitoring.recalibration import ExpectedFrame, recalibrate, residual_px

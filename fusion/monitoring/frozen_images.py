@@ -14,9 +14,8 @@ import numpy as np
 from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.logs import about
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
-from fusion.model.observations import MarkerTable
+from fusion.model.observations import CameraArray, MarkerTable
 from fusion.monitoring.clocks.time_search import Snapshot
 from fusion.monitoring.expected_views import ExpectedViews
 

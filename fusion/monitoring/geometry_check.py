@@ -13,8 +13,7 @@ import numpy as np
 
 from camera_node.detection.disc_pose import decompose
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.model.states import States
 
 MISFIT_PX = 1.0  # RMS residual; a good calibration has 0.1 to 0.5

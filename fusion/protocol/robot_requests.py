@@ -45,7 +45,7 @@ def reframe_robot(
     program: str,
     timeout_s: float = REQUEST_S,
 ) -> Robots:
-    """Replace a robot by `change` of it, such as `fusion.model.robot_frame.move_origin`; it is acquired again.
+    """Replace a robot by `change` of it, such as `fusion.model.robots.move_origin`; it is acquired again.
 
     `program` asks for it, such as "fusion robots turn", for the server's audit.
 

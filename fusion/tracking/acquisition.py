@@ -11,12 +11,11 @@ import numpy as np
 
 from camera_node.foundation.arrays import Index
 from fusion._core import SLACK_PX
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import Assignments, DetectionTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, mean_by_body
 from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
-from fusion.tracking.gating import MAX_CHI2, mean_by_body
+from fusion.tracking.gating import MAX_CHI2
 from fusion.tracking.grouping.marker_search import MarkerSearch
 from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.identity.confirmation import WeakFits

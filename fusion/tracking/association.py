@@ -15,9 +15,8 @@ from scipy.optimize import linear_sum_assignment
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.model.states import States
 from fusion.tracking.estimator import Prediction
 

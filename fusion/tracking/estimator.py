@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import MatchedObservations
+from fusion.model.observations import CameraArray, MatchedObservations
 from fusion.model.states import States, Transition, predict, reset_unobservable
 from fusion.tracking.gating import AXIS_SIGMA_PX
 

@@ -1,12 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Gates, noise levels and initial covariances shared by the trackers, and the misfit that they test."""
-
-import numpy as np
-from numpy.typing import NDArray
-
-from camera_node.foundation.arrays import Array, Index
-from fusion._core import SLACK_PX
-from fusion.model.observations import MatchedObservations
+"""Gates, noise levels and initial covariances shared by the trackers."""
 
 MAX_CHI2 = (
     8.0  # mean squared Mahalanobis residual of a robot or marker, including SLACK_PX of calibration error
@@ -24,20 +17,3 @@ FORGET_NS = 300_000_000  # unlabeled markers are forgotten after this time witho
 START_SIGMAS = (0.2, 0.05, 4.0, 1.5)
 START_SIGMAS_SINGLE = (0.3, 0.05, 10.0, 1.5)  # of a single marker
 START_S = 1e-3  # shortest prediction interval; the motion model needs a positive one
-
-
-def misfit(observations: MatchedObservations, residuals_px: Array) -> Array:
-    """(N,) squared residuals in standard deviations, including `SLACK_PX`; infinite where not visible.
-
-    Args:
-        observations: N observations.
-        residuals_px: (2, N), NaN where the disc is not visible.
-    """
-    cov = observations.detections.cov
-    d2 = np.sum(residuals_px**2, 0) / ((cov[0, 0] + cov[1, 1]) / 2 + SLACK_PX**2)
-    return np.nan_to_num(d2, nan=np.inf)
-
-
-def mean_by_body(values: NDArray, body: Index, n_bodies: int) -> Array:
-    """(B,) means of values (N,) of the bodies (N,); 0 for bodies without values."""
-    return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)

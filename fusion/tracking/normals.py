@@ -9,8 +9,7 @@ import numpy as np
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.sphere import fibonacci_sphere
 from fusion import _core
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import DetectionTable
+from fusion.model.observations import CameraArray, DetectionTable
 from fusion.tracking.gating import AXIS_SIGMA_PX, DECISIVE_CHI2
 from fusion.tracking.grouping.multiview import Marker
 

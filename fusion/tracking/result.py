@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import wxyz_from_rotation
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.model.states import POSITION, States
 from fusion.protocol.pose_messages import Latency, Markers, RobotPose
 from fusion.tracking.estimator import Prediction

@@ -11,11 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
+from fusion.model.observations import (
+    Assignments,
+    DetectionTable,
+    MarkerTable,
+    MatchedObservations,
+    mean_by_body,
+)
 from fusion.model.states import POSITION, States
 from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, cost_of
 from fusion.tracking.estimator import Estimator, Prediction
-from fusion.tracking.gating import MAX_CHI2, mean_by_body, misfit
+from fusion.tracking.gating import MAX_CHI2
 from fusion.tracking.joint_compatibility import jointly_compatible
 
 # Squared residual over that of calibration errors, from which a robot's detections are compared.
@@ -80,7 +86,7 @@ class RobustUpdate:
         states, residuals = self._estimator.update(prediction, observations)
         assignments = assignments.with_residuals(residuals)
         body, n = observations.discs.body, len(prediction.states)
-        squared = misfit(observations, residuals)
+        squared = observations.misfit(residuals)
         contradicted = mean_by_body(squared > MAX_CHI2, body, n) > CONTRADICTED
         rows, fits = np.flatnonzero(contradicted), ~contradicted[body]
         if len(rows):
@@ -144,6 +150,6 @@ class RobustUpdate:
             states,
             fitted.assignments.select(others).joined(changed),
             fitted.prediction,
-            np.concatenate([fitted.squared[others], misfit(observations, residuals)]),
+            np.concatenate([fitted.squared[others], observations.misfit(residuals)]),
             fitted.n_rejected,
         )

@@ -8,10 +8,9 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Index, Mask
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
-from fusion.model.observations import Assignments, DetectionTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable
 from fusion.model.robots import Robot
 from fusion.monitoring.camera_monitors import CameraMonitors
 from fusion.monitoring.clocks.time_search import Snapshot

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.camera_array import CameraArray, Discs
-from fusion.model.observations import DetectionTable, MatchedObservations
+from fusion.model.observations import CameraArray, DetectionTable, Discs, MatchedObservations, mean_by_body
 from fusion.model.robots import MOTIONS
 from fusion.model.states import POSITION, States, reset_unobservable
 from fusion.tracking.company import Company
@@ -25,8 +24,6 @@ from fusion.tracking.gating import (
     MAX_CHI2,
     POSITION_GATE,
     START_SIGMAS_SINGLE,
-    mean_by_body,
-    misfit,
 )
 from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.normals import start_rotation
@@ -237,7 +234,7 @@ class UnlabeledTracker:
         discs = Discs(detections.frame[rows], body, body, centres, up, tracks.radius[seen][body])
         observations = MatchedObservations.of_discs(detections.select(rows), discs)
         states, residuals = self._estimator(n).update(Prediction.without_motion(before), observations)
-        return states, mean_by_body(misfit(observations, residuals), body, n) < MAX_CHI2
+        return states, mean_by_body(observations.misfit(residuals), body, n) < MAX_CHI2
 
     def _estimator(self, n: int) -> Estimator:
         return Estimator(self._cameras, np.tile(MOTIONS["aerial"].densities, (n, 1)), np.ones(n, bool))

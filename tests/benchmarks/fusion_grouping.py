@@ -16,9 +16,8 @@ import numpy as np
 from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.observations import DetectionTable
+from fusion.model.observations import CameraArray, DetectionTable
 from fusion.model.robots import Robot
 from fusion.tracking.grouping.multiview import Marker, find_markers
 from tests.benchmarks.fusion_load import DIAMETER_M, DISTORTION, LENS, Load

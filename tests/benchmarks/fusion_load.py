@@ -12,9 +12,8 @@ from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from fusion.errors import FusionError
-from fusion.model.camera_array import CameraArray, Exposures
 from fusion.model.frames import CalibratedFrame
-from fusion.model.observations import MarkerTable
+from fusion.model.observations import CameraArray, Exposures, MarkerTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.model.states import States
 from tests.calib.synthetic import outlines

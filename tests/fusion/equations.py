@@ -12,8 +12,14 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
-from fusion.model.camera_array import CameraArray, Discs, Exposures, Views
-from fusion.model.observations import DetectionTable, MatchedObservations
+from fusion.model.observations import (
+    CameraArray,
+    DetectionTable,
+    Discs,
+    Exposures,
+    MatchedObservations,
+    Views,
+)
 from fusion.model.states import (
     OMEGA,
     POSITION,

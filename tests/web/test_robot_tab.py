@@ -10,8 +10,7 @@ from playwright.sync_api import Page
 
 from camera_node.protocol.server_connection import ServerConnection
 from fusion.client.arena import Arena as Client
-from fusion.model.robot_frame import turn_heading
-from fusion.model.robots import load_robots
+from fusion.model.robots import load_robots, turn_heading
 from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import TRIANGLE
 from tests.waiting import wait_for

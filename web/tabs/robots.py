@@ -9,8 +9,7 @@ import viser
 
 from camera_node.foundation.config import require_name
 from fusion.errors import FusionError
-from fusion.model.robot_frame import move_origin, turn_heading
-from fusion.model.robots import save_robots
+from fusion.model.robots import move_origin, save_robots, turn_heading
 from fusion.protocol.pose_messages import Robots, RobotsRequest
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription

@@ -19,9 +19,8 @@ import numpy as np
 
 from camera_node.foundation.arrays import Mask
 from camera_node.foundation.logs import about
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.monitoring.clocks.arrival_monitor import ArrivalMonitor
 from fusion.monitoring.clocks.clock_comparison import FAST_NS, ClockComparison
 from fusion.monitoring.clocks.clock_drift import Drift

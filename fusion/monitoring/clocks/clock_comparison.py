@@ -11,8 +11,13 @@ from collections.abc import Collection
 import numpy as np
 
 from camera_node.foundation.arrays import Mask
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
+from fusion.model.observations import (
+    Assignments,
+    CameraArray,
+    DetectionTable,
+    MarkerTable,
+    MatchedObservations,
+)
 from fusion.monitoring.clocks.clock_drift import HALF_NS, Drift, DriftMonitor, with_mean_velocities
 from fusion.monitoring.clocks.time_offsets import (
     Disagreement,

@@ -12,8 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import MatchedObservations
+from fusion.model.observations import CameraArray, MatchedObservations
 from fusion.model.states import POSITION, THETA, States
 
 SLACK_PX = 0.5  # of calibration errors, in quadrature to the noise of a detection

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.camera_array import CameraArray, Exposures
 from fusion.model.frames import CalibratedFrame
-from fusion.model.observations import MarkerTable
+from fusion.model.observations import CameraArray, Exposures, MarkerTable
 from fusion.model.states import States
 
 RANGE_S = 1.25  # largest offset that is searched for

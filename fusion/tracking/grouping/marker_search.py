@@ -4,8 +4,7 @@
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.tracking.gating import ANY_DIAMETERS, DIAMETER_TOLERANCE
 from fusion.tracking.grouping.multiview import Marker, find_markers
 from fusion.tracking.grouping.portions import Portion, limit_of, portion_of

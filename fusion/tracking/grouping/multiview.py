@@ -27,8 +27,7 @@ from scipy.spatial import KDTree
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import DetectionTable
+from fusion.model.observations import CameraArray, DetectionTable
 from fusion.tracking.grouping.motion import (
     diameters_of,
     frames_of,

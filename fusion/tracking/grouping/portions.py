@@ -7,8 +7,7 @@ from math import sqrt
 import numpy as np
 
 from camera_node.foundation.arrays import Index
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import DetectionTable
+from fusion.model.observations import CameraArray, DetectionTable
 from fusion.tracking.grouping.rays import rays_of
 
 MIN_LIMIT = 10  # detections of a frame in a portion: those of two robots

@@ -7,8 +7,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
 from fusion import _core
-from fusion.model.camera_array import CameraArray, Exposures
-from fusion.model.observations import DetectionTable
+from fusion.model.observations import CameraArray, DetectionTable, Exposures
 from fusion.tracking.gating import DIAMETER_TOLERANCE, MAX_SPEED_M_S
 
 SIGMAS = 3.5

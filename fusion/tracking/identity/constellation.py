@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rigid_motions
 from fusion import _core
-from fusion.model.camera_array import CameraArray
 from fusion.model.likeness import MIN_MARKERS, distances
+from fusion.model.observations import CameraArray
 from fusion.model.robots import Robot
 from fusion.tracking.gating import DIAMETER_TOLERANCE
 from fusion.tracking.grouping.multiview import Marker

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.camera_array import CameraArray
-from fusion.model.observations import DetectionTable, MarkerTable, MatchedObservations
+from fusion.model.observations import CameraArray, DetectionTable, MarkerTable, MatchedObservations
 from fusion.monitoring.frame_consistency import AssignedFrames
 from fusion.tracking.estimator import Estimator
 

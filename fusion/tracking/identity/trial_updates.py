@@ -7,7 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable, MatchedObservations
+from fusion.model.observations import (
+    Assignments,
+    DetectionTable,
+    MarkerTable,
+    MatchedObservations,
+    mean_by_body,
+)
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
@@ -15,8 +21,6 @@ from fusion.tracking.gating import (
     START_S,
     START_SIGMAS,
     START_SIGMAS_SINGLE,
-    mean_by_body,
-    misfit,
 )
 from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.identity.constellation import Fits
@@ -75,7 +79,7 @@ def refine(
     estimator = estimator.select(starts.robot)
     prediction = estimator.predict(starts.states, np.full(n, START_S))
     states, residuals = estimator.update(prediction, observations, SMALL)
-    d2 = misfit(observations, residuals)
+    d2 = observations.misfit(residuals)
     rows = starts.robot.tolist()
     history = np.array(
         [history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]

@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.camera_array import CameraArray, Discs, Views
-from fusion.model.observations import Assignments, DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, Discs, MarkerTable, Views
 from fusion.model.states import States
 from fusion.tracking.association import assign
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from camera_node.foundation.errors import ConfigError
 from fusion.commands.robots import robots
 from fusion.errors import FusionError
-from fusion.model.robot_frame import DECIMALS, MAX_PIVOT_M, move_origin, turn_heading
-from fusion.model.robots import load_robots
+from fusion.model.robots import DECIMALS, MAX_PIVOT_M, load_robots, move_origin, turn_heading
 from tests.conftest import ROOT
 from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import TRIANGLE

@@ -14,9 +14,8 @@ from scipy.optimize import linear_sum_assignment
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
-from fusion.model.camera_array import CameraArray, Discs
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.observations import DetectionTable, MatchedObservations
+from fusion.model.observations import CameraArray, DetectionTable, Discs, MatchedObservations
 from fusion.model.states import States, predict
 from fusion.tracking.association import assign
 from tests.fusion import equations

@@ -6,9 +6,8 @@ import pytest
 
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import rotation_from_vector
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.observations import MarkerTable
+from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.tracking.association import Association

@@ -9,11 +9,10 @@ import pytest
 
 from camera_node.detection.roundels import Roundels
 from fusion.errors import FusionError
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.likeness import distances
 from fusion.model.limits import Limits
-from fusion.model.observations import DetectionTable
+from fusion.model.observations import CameraArray, DetectionTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking import acquisition

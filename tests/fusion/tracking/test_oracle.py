@@ -18,9 +18,8 @@ from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import rotation_from_vector
 from fusion._core import CAUCHY, NOMINAL_WEIGHT
-from fusion.model.camera_array import CameraArray, Discs
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.observations import DetectionTable, MatchedObservations
+from fusion.model.observations import CameraArray, DetectionTable, Discs, MatchedObservations
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator, Prediction
 from tests.fusion.synthetic import ring

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusion.model.camera_array import CameraArray
 from fusion.model.frames import FrameSet
-from fusion.model.observations import DetectionTable, MarkerTable, MatchedObservations
+from fusion.model.observations import CameraArray, DetectionTable, MarkerTable, MatchedObservations
 from fusion.model.states import States
 from fusion.monitoring.expected_views import ExpectedViews
 from fusion.server.frame_synchronizer import FrameSynchronizer

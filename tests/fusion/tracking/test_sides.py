@@ -13,10 +13,9 @@ from camera_node.detector import Detector
 from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_rotation
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import Scene
-from fusion.model.camera_array import CameraArray, Exposures
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
-from fusion.model.observations import DetectionTable, MarkerTable
+from fusion.model.observations import CameraArray, DetectionTable, Exposures, MarkerTable
 from fusion.model.robots import Robot, load_robots
 from fusion.model.states import States
 from fusion.server.frame_synchronizer import FrameSynchronizer
