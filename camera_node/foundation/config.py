@@ -33,18 +33,21 @@ _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def example_file(name: str) -> Path:
-    """An example of `configs/`, such as `wand.yaml`: the checkout's, or the one that the package contains.
+    """An example of `configs/`, such as `wand.yaml`; see `shipped_path`."""
+    return shipped_path(f"configs/{name}")
+
+
+def shipped_path(name: str) -> Path:
+    """A file or folder of `configs/` or `examples/`: the checkout's, or the one that the package contains.
 
     Raises:
         ConfigError: there is neither.
     """
     package = Path(__file__).resolve().parents[1]
-    for configs in (package.parent / "configs", package / "configs"):
-        if (path := configs / name).is_file():
+    for root in (package.parent, package):
+        if (path := root / name).exists():
             return path
-    raise ConfigError(
-        f"the example {name} is not installed; reinstall the package, or give a file of your own"
-    )
+    raise ConfigError(f"{name} is not installed; reinstall the package, or give a file of your own")
 
 
 def is_name(text: str) -> bool:

@@ -20,10 +20,10 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.relative import DiscLocalizer
 from camera_node.detection.roundels import LocatedRoundels
 from camera_node.geometry.lens import Lens
+from formation.live_formation import FormationScore
 from tests.camera_node.rendering import expose
 from tests.camera_node.tracing import Sight, pixels_across, trace
-from web.formation.formation import FormationScore
-from web.formation.lockstep import run_lockstep
+from tests.examples.lockstep import run_lockstep
 
 DIAMETER_M, FOCAL_PX, NOISE = 0.1, 600.0, 2.5
 SIZES_PX, SLANTS_DEG = (14, 20, 40, 80), (0, 5, 10, 20, 35, 60)

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`roundel demo`: a whole arena with simulated cameras."""
 
+import sys
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
+from camera_node.foundation.config import shipped_path
 from camera_node.foundation.errors import ConfigError
 
 
@@ -47,7 +50,6 @@ class RunDemo:
         )
 
     def _run_formation(self) -> int:
-        from web.formation.demo import run_formation
         from web.view import check_port
 
         if self.scene is not None:
@@ -55,4 +57,5 @@ class RunDemo:
         if not self.headless:
             check_port(self.host, self.port)
         page = None if self.headless else (self.host, self.port)
-        return run_formation(self.listen, page, self.seconds)
+        sys.path.append(str(shipped_path("examples")))
+        return import_module("formation.live_formation").run_formation(self.listen, page, self.seconds)

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from camera_node.detection.roundels import LocatedRoundels
+from formation.formation_control import BLIND_S, DISTANCE_M, Follower, Leader, RelativeEstimator, place_of
+from formation.formation_robots import DIMMEST, STANDSTILL, RobotWorld, between, compose, light, moved, wrap
+from formation.live_formation import SETTLED_S, FormationScore, start_world, wanted_distances
 from tests.conftest import free_port
-from web.formation.control import BLIND_S, DISTANCE_M, Follower, Leader, place_of
-from web.formation.estimator import RelativeEstimator
-from web.formation.formation import SETTLED_S, FormationScore, start_world, wanted_distances
-from web.formation.lockstep import run_lockstep
-from web.formation.planar import between, compose, moved, wrap
-from web.formation.vision import DIMMEST, light
-from web.formation.world import STANDSTILL, RobotWorld
+from tests.examples.lockstep import run_lockstep
 
 FRAME_S = 1 / 30
 TIGHT = np.full(3, 0.05)

@@ -9,10 +9,9 @@ from collections.abc import Iterator
 from camera_node.detection.detector import Detector
 from camera_node.detection.relative import DiscLocalizer
 from camera_node.protocol.messages import RelativePositions, decode, encode
-from web.formation.control import Controller
-from web.formation.formation import FormationScore, controllers, start_world
-from web.formation.vision import CAMERA, FPS, ROUNDEL, RobotCamera, paint_background
-from web.formation.world import RobotWorld
+from formation.formation_control import Controller
+from formation.formation_robots import CAMERA, FPS, ROUNDEL, RobotCamera, RobotWorld, paint_background
+from formation.live_formation import FormationScore, controllers, start_world
 
 
 class RobotProgram:
