@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Prints the README's table of cameras: `python docs/camera_table.py`.
+"""Prints the table of cameras in docs/cameras.md: `python docs/camera_table.py`.
 
 Four cameras of each kind hang as in configs/plan.yaml. The planner predicts their errors for robots at rest and at
 0.5 m/s, and the range within which a level roundel of 9 cm is found.

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Runs every command of README.md, with shorter times and reserved ports."""
+"""Runs the commands of README.md and of the pages about a first arena, with shorter times and reserved ports."""
 
 import contextlib
+import itertools
 import re
 import shlex
 import shutil
@@ -18,24 +19,23 @@ import pytest
 from camera_node.foundation.errors import TEMPORARY_FAILURE
 from tests.calib.boards import SPEC, board_poses, render
 from tests.conftest import ROOT, free_port
+from tests.pages import PYTHON, commands, page, programs
 from tests.waiting import wait_for_port
 from tests.web.roundel.programs import Program
 
-BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 README = (ROOT / "README.md").read_text()
+# With README.md, the pages whose commands run here.
+PAGES = ("calibration.md", "first_arena.md", "offline.md", "troubleshooting.md")
 DEADLINE_S = 120.0
 MAIN = "from web.roundel.command import main; main()"  # of the command `roundel`
 
 
-def blocks(language: str) -> list[str]:
-    return [text for kind, text in BLOCK.findall(README) if kind == language]
-
-
-COMMANDS = [line for block in blocks("sh") for line in block.splitlines()]
+COMMANDS = dict.fromkeys([*commands(README), *itertools.chain(*map(page, PAGES)), *page("lab.md")])
+OWN = [command for command in COMMANDS if command not in page("lab.md")]
 
 
 def find(start: str) -> str:
-    """Return the one command of the README that begins with a text."""
+    """Return the one command of the pages that begins with a text."""
     (command,) = [command for command in COMMANDS if command.startswith(start)]
     return command
 
@@ -62,15 +62,27 @@ def run(command: str, folder: Path, expected: int = 0) -> subprocess.CompletedPr
 
 
 def test_every_command_has_a_test():
-    """A command that is added to the README needs a test here."""
+    """A command that is added to the README, or to one of the pages, needs a test here."""
     tested = (
         *("make demo", 'make demo ARGS="--headless', "make test", "make check"),  # test_demo.py, .ci/run
         *("python3 -m venv ~/roundel", "~/roundel/bin/pip install"),  # test_packaging.py
-        *("roundel print", "roundel detect", "roundel simulate", "roundel calibrate", "roundel plan"),
-        *("roundel up", "roundel camera", "roundel server", "roundel view", "roundel define"),
-        *("roundel run", "roundel ros2"),
+        "~/roundel/bin/roundel demo",  # test_demo.py
+        *("roundel print", "roundel detect", "roundel simulate", "roundel calibrate"),
+        *("roundel up", "roundel camera", "roundel define", "roundel run"),
     )
-    assert [command for command in COMMANDS if not command.startswith(tested)] == []
+    assert [command for command in OWN if not command.startswith(tested)] == []
+
+
+def test_the_readme_is_short():
+    """At most 700 words, with one picture, which is in the repository."""
+    assert len(README.split()) <= 700
+    assert re.findall(r"!\[[^]]*\]\(([^)]*)\)", README) == ["docs/demo.webp"]
+    assert (ROOT / "docs" / "demo.webp").exists()
+
+
+@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\((?!http)([^)#]+)", README))))
+def test_a_link_of_the_readme_leads_to_a_file(link: str):
+    assert (ROOT / link).exists()
 
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c.startswith("make")])
@@ -101,13 +113,13 @@ def test_printing_and_detecting(folder: Path):
 @pytest.mark.computed
 def test_the_plan(folder: Path):
     """The README's figure of the planned arena is what the planner computes."""
-    text = run(find("roundel plan"), folder).stdout
+    text = run("roundel plan configs/plan.yaml", folder).stdout
     (share,) = re.findall(r"two cameras or more see (\d+ %) of it", README)
     assert f"two cameras or more see {share.replace(' ', '')} of the area" in text
 
 
 def test_an_arena_of_one_machine(folder: Path):
-    """`roundel up` of the README creates its folder, and serves the page until it is stopped."""
+    """`roundel up` creates its folder, and serves the page until it is stopped."""
     port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
     command = [*words(find("roundel up")), "--port", str(port), "--listen", endpoint]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as up:
@@ -137,7 +149,7 @@ def test_lenses_and_world(folder: Path):
 def test_a_recording_from_frames_to_poses(folder: Path):
     """A shorter recording of the simulator; the resulting poses contain all three robots."""
     shorter = {"--seconds 15": "--seconds 8", "--seconds 5": "--seconds 1"}
-    for command in blocks("sh")[COMMAND_BLOCK].splitlines():
+    for command in page("offline.md"):
         for long, short in shorter.items():
             command = re.sub(rf"{long}$", short, command)
         run(command, folder)
@@ -145,14 +157,27 @@ def test_a_recording_from_frames_to_poses(folder: Path):
     assert {row.split(",")[1] for row in rows if ",tracked," in row} == {"rover", "drone", "puck"}
 
 
-COMMAND_BLOCK = next(k for k, block in enumerate(blocks("sh")) if "roundel simulate" in block)
+@pytest.mark.slow
+def test_a_recording_from_frames_to_poses_in_python(folder: Path):
+    """The program of the page, with a shorter recording."""
+    (code,) = programs("offline.md")
+    code = code.replace("seconds=15", "seconds=8").replace("seconds=5", "seconds=1")
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("grade ")
+    assert {line.split()[1] for line in done.stdout.splitlines() if " tracked " in line} == {
+        "rover",
+        "drone",
+        "puck",
+    }
 
 
 @pytest.fixture
 def server(folder: Path) -> Iterator[tuple[Path, str]]:
-    """The README's live server on a reserved port, and its endpoint."""
+    """The server of docs/lab.md on a reserved port, and its endpoint."""
     endpoint = f"tcp/localhost:{free_port()}"
-    command = [*words(find("roundel server")), "--listen", endpoint]
+    command = [*words(find("roundel server --config configs/arena.yaml")), "--listen", endpoint]
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         first = process.stderr.readline()
@@ -163,7 +188,7 @@ def server(folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 def test_the_live_programs(server: tuple[Path, str]):
-    """With the README's server: commands that need cameras exit with an error; the view serves its page."""
+    """With that server: commands that need cameras exit with an error; the view serves its page."""
     folder, endpoint = server
     if not list(Path("/dev").glob("video*")):
         assert (
@@ -215,10 +240,10 @@ def run_demo_with_clients(folder: Path, scene: Path) -> tuple[int, str, str]:
         The demo's exit code, what it printed, and the Python program's first line.
     """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    (code,) = [block for block in blocks("python") if "Arena.connect" in block]
+    (code,) = PYTHON.findall(README)
     (folder / "follow.py").write_text(code.replace("tcp/localhost:7447", endpoint))
     command = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "12"]
-    ros2 = words(find("roundel ros2").replace("tcp/localhost:7447", endpoint))
+    ros2 = words(f"roundel ros2 --connect {endpoint} --arena demo")
     with contextlib.ExitStack() as stack:
 
         def start(command: list[str]) -> Program:

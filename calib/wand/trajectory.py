@@ -6,7 +6,7 @@ Robotics, section 11.1; Anderson and Barfoot 2015), so a marker's position at an
 
 The wand is expressed in affine coordinates: every marker is a fixed combination of one to four basis markers, whose
 mutual distances keep the wand rigid. A straight wand has no unobservable rotation about its axis in this form.
-docs/wand_adjustment.md has the equations.
+docs/design/wand_adjustment.md has the equations.
 """
 
 from dataclasses import dataclass

@@ -4,7 +4,7 @@
 A request bounds the offset from above and its reply from below, each by its own delay (Marzullo and Owicki 1983). The
 drift is bounded by the lower envelopes of both one-way delays (after Moon, Skelly and Towsley, INFOCOM 1999). The
 estimate is the middle of the remaining band, which has the least worst-case error and, for equally distributed random
-delays, the greatest likelihood (Jeske, IEEE Trans. Communications 2005). See docs/clock_offset.md for the derivation.
+delays, the greatest likelihood (Jeske, IEEE Trans. Communications 2005). docs/design/clock_offset.md derives it.
 """
 
 from collections import deque

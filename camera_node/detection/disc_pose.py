@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Computes the two poses of a disc that explain its ellipse in one view and its known diameter.
 
-See docs/detector_model.md, section 9.
+See docs/design/detector_model.md, section 9.
 """
 
 from collections.abc import Iterator

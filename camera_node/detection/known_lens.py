@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Makes the outlines of detected roundels more precise where the camera's intrinsics are known.
 
-See docs/detector_model.md, section 9a.
+See docs/design/detector_model.md, section 9a.
 """
 
 import numpy as np

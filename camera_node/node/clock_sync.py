@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Converts this machine's time to the server's: by round trips over Zenoh, or directly where both share one clock.
 
-`camera_node.clocks.clock_offset` estimates the offset; docs/clock_offset.md describes the method.
+`camera_node.clocks.clock_offset` estimates the offset; docs/design/clock_offset.md describes the method.
 """
 
 import logging

@@ -3,7 +3,7 @@
 
 A camera of focal lengths f_x, f_y and an image of w x h pixels sees a pattern of outer diameter d_o at the distance x
 along its optical axis, turned by phi about the vertical and by psi about the horizontal axis of the image. The model
-has no distortion and no blur; `camera_node.sensor_model.visibility` has both. See docs/sensor_model.md.
+has no distortion and no blur; `camera_node.sensor_model.visibility` has both. See docs/design/sensor_model.md.
 """
 
 from dataclasses import dataclass

@@ -3,7 +3,7 @@
 
 A point of an edge with contrast c, blur b and noise sigma_n determines its position along the edge's normal with the
 information c^2 / (2 sqrt(pi) b sigma_n^2) for each pixel of the edge's length. The pose of the disc moves every point
-of both circles; the sum over both circles is the information on the pose. docs/sensor_model.md has the derivation.
+of both circles; the sum over both circles is the information on the pose. docs/design/sensor_model.md derives it.
 """
 
 from dataclasses import dataclass
@@ -186,7 +186,7 @@ def _across_edge(blur_px: Array, dark_px: Array, bright_px: Array) -> Array:
 def _ellipse_centre_jacobian(lens: Lens, radius: float, position: Array, frame: Array) -> Array:
     """(N, 2, 5) derivative of the outer ellipse's centre by position and by rotations of the normal about e1 and e2.
 
-    The centre is the projection of q = c + r^2 / c_z (n_z n - e_z); see docs/fusion_filter.md, section 3.
+    The centre is the projection of q = c + r^2 / c_z (n_z n - e_z); see docs/design/fusion_filter.md, section 3.
     """
     n, z = frame[:, :, 2], np.array([0.0, 0.0, 1.0])
     lift = (radius**2 / position[:, 2])[:, None]

@@ -2,7 +2,7 @@
 """D, the smallest size of a pattern's image that our detector finds, as measured.
 
 Measured by `python -m tests.benchmarks.paper threshold`, which prints these tables: roundels with the card's default
-margin, found in new images. docs/sensor_model.md shows the measurement.
+margin, found in new images. docs/design/sensor_model.md shows the measurement.
 """
 
 from dataclasses import dataclass

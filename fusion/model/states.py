@@ -3,7 +3,7 @@
 
 The error of a state is (delta theta, delta p, delta omega, delta v). The rotation is R exp(delta theta), in the body
 frame; the other parts are added in the world frame. White noise on acceleration drives the motion (Bar-Shalom et al.
-2001, section 6.2.2); see docs/fusion_filter.md.
+2001, section 6.2.2); see docs/design/fusion_filter.md.
 """
 
 from dataclasses import dataclass

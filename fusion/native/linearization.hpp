@@ -2,7 +2,7 @@
 #pragma once
 #include "outline.hpp"
 
-/// Linearizes observations about the predicted states; see docs/fusion_filter.md.
+/// Linearizes observations about the predicted states; see fusion_filter.md.
 namespace roundel::fusion {
 
 constexpr int kErrors =

@@ -5,7 +5,7 @@
 
 The graph has one component for each robot, with two HessianFactors: the predicted posterior, and the observations.
 `native/linearization.cpp` linearizes each observation at its own capture time, `native/normal_equations.cpp` weighs
-them (Cauchy). See docs/fusion_filter.md.
+them (Cauchy). See docs/design/fusion_filter.md.
 """
 
 from dataclasses import dataclass, replace

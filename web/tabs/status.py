@@ -78,7 +78,7 @@ def _event_html(event: Event) -> str:
 
 def snippet(endpoint: str, arena: str) -> str:
     """Where poses are published, and a program that prints them; a click selects it."""
-    program = f"""from fusion.client import Arena
+    program = f"""from roundel import Arena
 
 with Arena.connect("{endpoint}", arena="{arena}") as arena:
     for pose in arena.poses():

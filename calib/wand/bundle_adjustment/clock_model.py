@@ -2,7 +2,7 @@
 """Decides which times of the cameras a recording shows: clock offsets, drifts, and readout times of rolling shutters.
 
 A parameter that the recording does not show costs accuracy where the cameras share exact clocks or have global
-shutters. docs/wand_adjustment.md, section 8, has the equations.
+shutters. docs/design/wand_adjustment.md, section 8, has the equations.
 """
 
 from dataclasses import dataclass, replace

@@ -6,7 +6,7 @@ a second; a covariance that takes every frame as independent is then too small. 
 corrects that (Liang and Zeger 1986; Cameron and Miller 2015): with the scores s_b, summed over blocks of time, and the
 information H, it is H^-1 (sum_b s_b s_b^T) H^-1, and equals H^-1 where residuals are independent. A minute has too few
 blocks for every entry, but enough for one factor: the mean of its eigenvalues over those of H^-1.
-docs/wand_adjustment.md has the equations.
+docs/design/wand_adjustment.md has the equations.
 """
 
 from dataclasses import dataclass, replace

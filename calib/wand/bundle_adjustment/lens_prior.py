@@ -6,7 +6,7 @@ many lenses and so estimates how far off they are (empirical Bayes: Efron and Mo
 share, by kind of parameter, has a marginal likelihood. In the estimate, its prior is a mixture (spike and slab;
 Mitchell and Beauchamp 1988): exact with probability 1/2, else of any order of magnitude, so exact lenses lose no
 accuracy. For the covariance, its prior is uniform between zero and the usual deviation (Gelman 2006), so errors that
-the recording cannot show count in full. docs/wand_adjustment.md has the equations.
+the recording cannot show count in full. docs/design/wand_adjustment.md has the equations.
 """
 
 from dataclasses import replace

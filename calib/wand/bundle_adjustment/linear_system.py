@@ -2,7 +2,8 @@
 """Linearizes the wand's bundle adjustment around a state, all observations in one NumPy batch.
 
 Every observation depends on one camera and on the two knots around its time. The observations of one camera between
-two knots are a `view`: the rows of one factor on (knot, next knot, camera). docs/wand_adjustment.md has the equations.
+two knots are a `view`: the rows of one factor on (knot, next knot, camera).
+See docs/design/wand_adjustment.md.
 """
 
 from dataclasses import dataclass

@@ -2,8 +2,7 @@
 """The residuals of the wand's bundle adjustment, and what whitens them.
 
 Residuals are the reprojection errors of marker centres at their own capture times, deviations of the motion from
-constant velocity, of the wand from its lengths, and of cameras from their priors. docs/wand_adjustment.md has the
-equations.
+constant velocity, of the wand from its lengths, and of cameras from their priors. See docs/design/wand_adjustment.md.
 """
 
 from dataclasses import dataclass, replace

@@ -6,7 +6,7 @@
 namespace roundel {
 
 /// What changes the picture of a roundel beside its model, as coefficients of functions of the place in the
-/// disc's plane (docs/detector_model.md, section 3b). In coordinates X, Y in outer radii, with X along the
+/// disc's plane (detector_model.md, section 3b). In coordinates X, Y in outer radii, with X along the
 /// minor axis of the image, the functions of light are X, Y, X^2 - Y^2, 2 X Y, X^2 + Y^2 and the four of
 /// third order, X^3 - 3 X Y^2, 3 X^2 Y - Y^3, X (X^2 + Y^2) and Y (X^2 + Y^2).
 ///

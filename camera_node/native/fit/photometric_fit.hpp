@@ -15,7 +15,7 @@
 namespace roundel {
 
 /// The displacement in blurs of an edge in a picture whose tone curve brightens the levels s between ink and
-/// paper by curvature s (1 - s), for each unit of curvature (docs/detector_model.md, section 3a). With
+/// paper by curvature s (1 - s), for each unit of curvature (detector_model.md, section 3a). With
 /// s = Phi(x), the least squares fit of a shift to s (1 - s): the integral of s (1 - s) ds, 1 / 6, over that
 /// of phi(x)^2 dx, 1 / (2 sqrt(pi)).
 constexpr double kEdgeShift = 0.5908179503;
@@ -60,7 +60,7 @@ struct Shading {
     double x = 0, y = 0, variance = 0;
 };
 
-/// The bend of the paper that the residuals show (docs/detector_model.md, section 3b): the squared length of
+/// The bend of the paper that the residuals show (detector_model.md, section 3b): the squared length of
 /// its two components and the variance of each, square minor half axes; 0 and 0 if it was not measured.
 /// `processing` is the score of displacements that no bend makes (`FieldScores`).
 struct Bend {
@@ -108,7 +108,7 @@ struct RoundelFit {
 };
 
 /// Fits a photometric model of a roundel to the pixels near its edges by Gauss-Newton (derivation:
-/// docs/detector_model.md). The model has 13 parameters: three grey levels (bright, dark between the outer
+/// detector_model.md). The model has 13 parameters: three grey levels (bright, dark between the outer
 /// and the inner circle, ground beyond the card's edge), the blur, the ratios of the inner circle and of the
 /// card, and seven of a plane's view. Tukey's biweight reduces the weight of pixels that disagree.
 ///

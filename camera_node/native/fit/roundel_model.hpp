@@ -9,7 +9,7 @@
 
 namespace roundel {
 
-/// The parameters of a roundel's picture (see docs/detector_model.md). A point X of its plane, in outer
+/// The parameters of a roundel's picture (see detector_model.md). A point X of its plane, in outer
 /// radii, projects to x = c + A X / (1 + g . X): c is the image of the disc's centre, g the perspective, and
 /// the image of every circle |X| = r is an ellipse.
 ///

@@ -28,7 +28,7 @@ struct ConstrainedEllipse {
 };
 
 /// Conditions a measurement on the knowledge that it is the picture of a circle of any size through this
-/// lens: five unknowns (position in radii, normal) for seven numbers (docs/detector_model.md, section 9a).
+/// lens: five unknowns (position in radii, normal) for seven numbers (detector_model.md, section 9a).
 ///
 /// `lens_sigma` is the standard deviation of the lens's error, relative to the offset's greatest size. A
 /// measurement that contradicts the lens is returned as it is.

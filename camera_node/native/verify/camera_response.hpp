@@ -15,7 +15,7 @@ namespace roundel {
 
 /// A camera's response, learned from the roundels that it sees: its tone curve, as the exponent that makes
 /// levels proportional to light, and the residuals that its processing leaves at edges
-/// (docs/detector_model.md, section 3).
+/// (detector_model.md, section 3).
 class CameraResponse {
   public:
     CameraResponse();

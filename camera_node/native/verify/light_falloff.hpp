@@ -9,7 +9,7 @@
 
 namespace roundel {
 
-/// How the light changes across the roundels of a camera (docs/detector_model.md, section 3): vignetting and
+/// How the light changes across the roundels of a camera (detector_model.md, section 3): vignetting and
 /// lamps make a relative gradient that is nearly linear in the place, s = (a + M u) / level
 /// with u from the middle of the picture in half diagonals, M symmetric, and each roundel has a rest of its
 /// own. The roundels in view teach all of it; in even light it is 0 and as good as certain.

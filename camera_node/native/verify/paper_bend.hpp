@@ -6,7 +6,7 @@
 
 namespace roundel {
 
-/// How much the prints bend that a camera sees (docs/detector_model.md, section 3b). A small roundel, and one
+/// How much the prints bend that a camera sees (detector_model.md, section 3b). A small roundel, and one
 /// that is seen frontally, shows no bend of its own, but is displaced by it; the other roundels of the camera
 /// show how much that may be. Flat prints teach that there is no bend, and their claims stay as they are.
 class PaperBend {

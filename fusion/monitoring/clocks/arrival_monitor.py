@@ -4,7 +4,7 @@
 The lag of a frame is its arrival minus its stamp: delays that all cameras share (the server's clock, its queue, the
 network), and the camera's own clock. So a change that more than half of the cameras share is no evidence about any of
 them; the cameras that do not share it changed relative to the others. A shared change is wrong for certain if frames
-arrive before their stamps since. See docs/time_offsets.md section 4.
+arrive before their stamps since. See docs/design/time_offsets.md section 4.
 """
 
 import logging

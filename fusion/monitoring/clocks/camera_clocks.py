@@ -6,7 +6,7 @@
     an excluded camera   -> `find_time_shift`: by how much?             -> corrected and used again
     slow information     -> `ClockComparison.drifts`                    -> corrected while in use
 
-See docs/time_offsets.md.
+See docs/design/time_offsets.md.
 """
 
 import logging

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compares the clocks of the cameras of each frame set by the robots that move; docs/time_offsets.md.
+"""Compares the clocks of the cameras of each frame set by the robots that move; docs/design/time_offsets.md.
 
 the last frame sets    -> `offset_information` -> a jump, at once
 0.1 s after each one   -> `DriftMonitor`       -> a slow departure

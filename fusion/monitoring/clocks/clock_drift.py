@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Finds cameras whose clocks depart slowly from the others, by an offset or at a rate; docs/time_offsets.md section 7.
+"""Finds cameras whose clocks depart slowly from the others, by an offset or at a rate.
+
+See docs/design/time_offsets.md, section 7.
 
 Information about the offsets is summed over windows of half a second or more. Calibration errors bias an offset, but
 the bias is about the same in all windows as long as the robots move alike; a clock that departs changes the offset from

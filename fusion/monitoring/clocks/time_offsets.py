@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Estimates the time offsets of all cameras together from moving robots; docs/time_offsets.md derives it.
+"""Estimates the time offsets of all cameras together from moving robots; docs/design/time_offsets.md derives it.
 
 A stamp that is off by d moves a detection by d times the image velocity of its marker; a camera that was moved
 slightly shifts all detections alike. Poses and velocities of the robots are free in each frame set, so the estimate
@@ -19,7 +19,7 @@ SLACK_PX = 0.5  # of calibration errors, in quadrature to the noise of a detecti
 FREE = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # pose and velocity of a state, which a wrong clock displaces too
 WEAK = 1.0  # prior information about rotations and positions, 1 / rad^2 and 1 / m^2
 REWEIGHTED = 1  # times: by the residuals that offsets do not explain
-CAUCHY = 4.0  # standard deviations, as in docs/fusion_filter.md section 4
+CAUCHY = 4.0  # standard deviations, as in docs/design/fusion_filter.md section 4
 SHIFT_PX = 2.0  # prior standard deviation of the shift of an image by calibration errors or a touch
 SIGMAS = 5.0  # by which an offset must differ from those of the majority
 EXPLAINED = 0.85  # of the contradiction, by the cameras at fault

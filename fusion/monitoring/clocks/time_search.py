@@ -3,7 +3,7 @@
 
 Each pair of a detection and the image trajectory of a marker votes for the time at which the marker passed there
 (a Hough transform over time). If the clock is wrong, the votes of all robots agree; if the camera was moved, they do
-not, or not with robots that stand still. See docs/time_offsets.md.
+not, or not with robots that stand still. See docs/design/time_offsets.md.
 """
 
 from collections.abc import Sequence

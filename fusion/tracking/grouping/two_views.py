@@ -7,7 +7,7 @@ pairs is the product of their x; sums over all sets give the probability of each
 belief propagation (Bayati et al. 2007). A pair is a point if it is probable: if no competing pair is comparably likely.
 
 The frame set itself tells the noise, the number of points that two cameras see, and how many rays pass each other by
-chance (expectation maximization). docs/fusion_filter.md section 7 has the equations.
+chance (expectation maximization). docs/design/fusion_filter.md section 7 has the equations.
 """
 
 from dataclasses import dataclass

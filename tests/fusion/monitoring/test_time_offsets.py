@@ -10,7 +10,7 @@ CAMERAS, BODIES, K = 5, 7, len(FREE)
 
 
 def dense(D: Array, body: Index, camera: Index) -> tuple[Array, Array]:
-    """The rows (2 N, 9 B + 3 C) and right sides of all unknowns together, as in docs/time_offsets.md."""
+    """The rows (2 N, 9 B + 3 C) and right sides of all unknowns together, as in docs/design/time_offsets.md."""
     J = np.zeros((len(D), 2, K * BODIES + 3 * CAMERAS))
     for n, (b, c) in enumerate(zip(body, camera, strict=True)):
         J[n, :, K * b : K * b + K] = D[n, :, :K]
