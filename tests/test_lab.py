@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 import tyro
 
-import camera_node.__main__ as camera_program
-import fusion.__main__ as fusion_program
-import web.__main__ as web_program
+from camera_node.commands.publish import Publish
+from fusion.commands.serve import Serve
 from tests.conftest import ROOT
+from web.roundel.view import ViewArena
 
 PROGRAMS: dict[str, Callable[[list[str]], object]] = {
-    "roundel-fusion": lambda words: tyro.cli(fusion_program.Serve, args=words),
-    "roundel-camera": lambda words: tyro.cli(camera_program.Publish, args=words),
-    "roundel-web": lambda words: tyro.cli(web_program.Options, args=words),
+    "roundel-fusion": lambda words: tyro.cli(Serve, args=words),
+    "roundel-camera": lambda words: tyro.cli(Publish, args=words),
+    "roundel-web": lambda words: tyro.cli(ViewArena, args=words),
 }
 SERVICES = sorted((ROOT / "configs" / "systemd").glob("*.service"))
 

@@ -87,7 +87,7 @@ class ArenaPrograms:
         return LocalCameras(paths, [*self._connect, *given_options(settings)], self._supervisor)
 
     def start_wand_calibration(self, seconds: float) -> None:
-        """Start `calib wand` on the running cameras, which writes the folder's rig and has the server use it."""
+        """Start `roundel calibrate wand` on the running cameras; it writes the rig and has the server use it."""
         rig = str(self._folder.rig)
         words = ["wand", "--live", "--seconds", str(seconds), "--wand", str(self._folder.wand)]
         self._supervisor.start(CALIBRATION, "calib", [*words, "--rig", rig, "--out", rig, *self._connect])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib check`: judges a rig by a wand recording."""
+"""`roundel calibrate check`: judges a rig by a wand recording."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ class Check(WandOptions):
     out: Path | None = None
     """Write the rig with the results in its `calibration` to this file."""
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Calibrate from the whole recording and from its halves, and compare."""
         self.require_recording()
         if self.out is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib import` and `calib export`: recordings and rigs from and to other programs."""
+"""`roundel calibrate import` and `roundel calibrate export`: recordings and rigs from and to other programs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +58,7 @@ class ImportData(_Conversion):
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Its files; of MultiCamSelfCal the folder."""
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Read all files, then write; nothing is written if one of them is not usable."""
         chosen = FORMATS[self.format]
         if chosen.read is None:
@@ -110,7 +110,7 @@ class ExportRig(_Conversion):
     rig: Path
     """The rig."""
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Write the files and print their names."""
         chosen, rig = FORMATS[self.format], load_rig(self.rig)
         self.make_folder()

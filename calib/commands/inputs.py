@@ -35,7 +35,7 @@ class WandOptions:
     fps: float | None = None
     """Frames a second, for a CSV with numbers of frames."""
     recording: Path | None = None
-    """Or read a recording (MCAP) of calib wand --live or of roundel record."""
+    """Or read a recording (MCAP) of roundel calibrate wand --live or of roundel record."""
     distance: tuple[str, str, float] | None = None
     """Two cameras and the metres between their lenses: the scale for a wand of one marker, else a check of the wand."""
     distance_sigma: float = SIGMA_M

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib intrinsics`: calibrates lenses from views of a board."""
+"""`roundel calibrate intrinsics`: calibrates lenses from views of a board."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.live import Live
 
-from calib.commands.connection import Connection, Server
 from calib.commands.inputs import require_one
 from calib.commands.output import check_folder, provenance, save_image, write_rig
 from calib.errors import CalibrationError
@@ -20,6 +19,7 @@ from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.rig import load_rig
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import progress_console, say, track
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +44,9 @@ class Intrinsics:
     """A folder for an image of each camera's residuals."""
     seconds: float = 180.0
     """The longest time for which images are requested from a running camera."""
-    server: Server = field(default_factory=Connection)
+    connection: ConnectionOptions = LOCAL_SERVER
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Calibrate, and write the lenses that are good; of the other cameras, the reasons are given.
 
         Raises:
@@ -88,8 +88,8 @@ class Intrinsics:
             yield views
 
     def _capture(self, views: BoardViews) -> BoardViews:
-        with self.server.open() as session:
-            images = take_snapshots(session, self.server.arena, views.camera, self.seconds)
+        with self.connection.open() as session:
+            images = take_snapshots(session, self.connection.arena, views.camera, self.seconds)
             with Live(console=progress_console(), transient=True) as live:
                 say(
                     capture_views(

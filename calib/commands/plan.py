@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib plan`: coverage and expected precision of an arena, planned or calibrated, and where to mount cameras."""
+"""`roundel plan`: coverage and expected precision of an arena, planned or calibrated, and where to mount cameras."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +43,7 @@ class PlanArena:
     catalogue: bool = False
     """List the cameras that a plan can name as `model`, and end."""
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Print the result; write the report and the suggested plan."""
         if self.catalogue:
             list_catalogue()

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib undo` and `calib redo`: restore the previous rig, or the one that was undone last."""
+"""`roundel calibrate undo` and `roundel calibrate redo`: restore the previous rig, or the one that was undone last."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from calib.commands.connection import Connection, Server
+from calib.commands.output import conclude
 from calib.rig.history import History, HistoryStep
 from calib.rig.rig import Rig, load_rig
 from camera_node.foundation.terminal import say
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +20,7 @@ class RestoreOptions:
     ..., newest last."""
     live: bool = False
     """Have the running server use the restored rig too."""
-    server: Server = field(default_factory=Connection)
+    connection: ConnectionOptions = LOCAL_SERVER
 
     def conclude(self, rig: Rig, step: HistoryStep, program: str) -> None:
         """Print what was restored, and hand it to the server."""
@@ -27,26 +28,26 @@ class RestoreOptions:
         made = f"made at {date}" if date else "no date recorded"
         replaced = f"; the rig that it replaces is saved as {step.replaced.name}" if step.replaced else ""
         say(f"restored {self.rig} from {step.restored.name} ({made}){replaced}")
-        self.server.conclude(rig, self.rig, program, live=self.live)
+        conclude(self.connection, rig, self.rig, program, live=self.live)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Undo(RestoreOptions):
-    """Restore the rig from before the last calibration; `calib redo` reverts that."""
+    """Restore the rig from before the last calibration; roundel calibrate redo reverts that."""
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Swap the files, and hand the restored rig to the server."""
         history = History(self.rig)
         rig = load_rig(history.previous())  # a broken one is not restored
-        self.conclude(rig, history.undo(), "calib undo")
+        self.conclude(rig, history.undo(), "roundel calibrate undo")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Redo(RestoreOptions):
     """Restore the rig that was undone last."""
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Swap the files, and hand the restored rig to the server."""
         history = History(self.rig)
         rig = load_rig(history.next())
-        self.conclude(rig, history.redo(), "calib redo")
+        self.conclude(rig, history.redo(), "roundel calibrate redo")

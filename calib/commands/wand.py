@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib wand`: calibrates camera poses from a wand that is waved in front of the cameras."""
+"""`roundel calibrate wand`: calibrates camera poses from a wand that is waved in front of the cameras."""
 
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 from rich.live import Live
 from zenoh import Session
 
-from calib.commands.connection import Connection, Server
 from calib.commands.inputs import WandOptions, require_positive
-from calib.commands.output import check_folder, provenance, save_maps, write_rig
+from calib.commands.output import check_folder, conclude, provenance, put_in_force, save_maps, write_rig
 from calib.commands.report import print_recalibration, print_report, show_progress
 from calib.errors import CalibrationError
 from calib.intrinsics.nominal_lens import FIELD_OF_VIEW_DEG, load_known_lenses, with_nominal_lenses
@@ -33,9 +32,10 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import console, progress_console, say
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from camera_node.sources.recorded_detections import read_observations
 
-PROGRAM = "calib wand"
+PROGRAM = "roundel calibrate wand"
 
 
 def add_nominal_lenses(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Rig:
@@ -76,9 +76,9 @@ class Wand(WandOptions):
     widen_lenses: float = 1.0
     """Multiply the standard deviations of the lenses by this, 1 or more: for lenses that changed since they were
     calibrated, or that are farther off than usual."""
-    server: Server = field(default_factory=Connection)
+    connection: ConnectionOptions = LOCAL_SERVER
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Calibrate and write the rig; nothing is written unless two cameras or more are placed."""
         check_folder(self.out)
         self.require_recording(live=self.live)
@@ -99,7 +99,7 @@ class Wand(WandOptions):
         if self.recording is not None:
             rig = add_nominal_lenses(rig, {m.camera: (m.width, m.height) for m in messages})
         placed = self._calibrate(rig, wand, messages, self.measured_distance(rig))
-        self.server.conclude(placed, self.out, PROGRAM, live=False)
+        conclude(self.connection, placed, self.out, PROGRAM, live=False)
 
     def _load_lenses(self) -> Rig:
         """The rig; without cameras if there is no file, and cameras can be added."""
@@ -153,9 +153,9 @@ class Wand(WandOptions):
         return msgspec.structs.replace(result.rig, calibration=figures)
 
     def _calibrate_live(self, rig: Rig, wand: Body) -> None:
-        with self.server.open() as session:
+        with self.connection.open() as session:
             if self.only is None:
-                rig = add_nominal_lenses(rig, running_camera_sizes(session, self.server.arena))
+                rig = add_nominal_lenses(rig, running_camera_sizes(session, self.connection.arena))
             distance = self.measured_distance(rig)
             collected, reason = self._collect(session, rig, wand, distance)
         say(f"the wand session ended: {reason}")
@@ -168,7 +168,7 @@ class Wand(WandOptions):
             if recording is not None:
                 say(f"the wand recording is saved; to calibrate from it again: {self._command(recording)}")
             raise
-        self.server.put_in_force(placed, self.out, PROGRAM)
+        put_in_force(self.connection, placed, self.out, PROGRAM)
 
     def _collect(
         self, session: Session, rig: Rig, wand: Body, distance: Distance | None
@@ -187,7 +187,7 @@ class Wand(WandOptions):
         with Live(console=progress_console(), transient=True) as live:
             return run_wand_session(
                 session,
-                self.server.arena,
+                self.connection.arena,
                 settings,
                 lambda progress: live.update(show_progress(progress)),
             )
@@ -196,7 +196,7 @@ class Wand(WandOptions):
         """Save the recording before the calibration, so that no failure there can lose it."""
         path = wand_recording_path(self.out)
         try:
-            backup = save_wand_recording(path, self.server.arena, messages)
+            backup = save_wand_recording(path, self.connection.arena, messages)
         except ConfigError as error:
             say(f"warning: the wand recording is not saved: {error}")
             return None
@@ -216,4 +216,4 @@ class Wand(WandOptions):
             words += ["--widen-lenses", self.widen_lenses]
         if self.distance is not None:
             words += ["--distance", *self.distance, "--distance-sigma", self.distance_sigma]
-        return shlex.join(["python", "-m", "calib", "wand", *map(str, words), *flags])
+        return shlex.join(["roundel", "calibrate", "wand", *map(str, words), *flags])

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`calib world`: fixes the ground plane, the origin and the axes."""
+"""`roundel calibrate world`: fixes the ground plane, the origin and the axes."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from calib.commands.connection import Connection, Server
 from calib.commands.inputs import read_recording, require_one, require_positive, require_several_cameras
-from calib.commands.output import check_folder, provenance, write_rig
+from calib.commands.output import check_folder, conclude, provenance, write_rig
 from calib.errors import CalibrationError
 from calib.live.collect import collect_with_progress
 from calib.rig.rig import Rig, load_rig
@@ -26,6 +25,7 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 
 UPSIDE_DOWN = 0.3  # mean upward component of the images' downward axes, above which cameras are upside down
 Landmarks = Mapping[str, Array]
@@ -62,9 +62,9 @@ class World:
     """Or collect from the running cameras; have the server use the result."""
     seconds: float = 3.0
     """How long to collect from running cameras."""
-    server: Server = field(default_factory=Connection)
+    connection: ConnectionOptions = LOCAL_SERVER
 
-    def execute(self) -> None:
+    def run(self) -> None:
         """Move the rig and write it; nothing is written unless the world is fixed."""
         check_folder(self.out)
         surveys = {"--positions CSV": self.positions, "--points FILE": self.points}
@@ -81,7 +81,7 @@ class World:
         figures = {**moved.calibration, "world": {**provenance(), "misses_mm": misses}}
         moved = msgspec.structs.replace(moved, calibration=figures)
         write_rig(moved, self.out)
-        self.server.conclude(moved, self.out, "calib world", live=self.live)
+        conclude(self.connection, moved, self.out, "roundel calibrate world", live=self.live)
 
     def _move(self, rig: Rig) -> tuple[Rig, dict[str, float]]:
         """The moved rig, and the distances of surveyed cameras or landmarks from their positions, metres."""
@@ -132,8 +132,8 @@ class World:
                 require_several_cameras(self.frames)
             return read_recording(rig, self.frames, self.observations, body=body)
         require_positive(self.seconds)
-        with self.server.open() as session:
-            return collect_with_progress(session, self.server.arena, self.seconds, "collecting").messages
+        with self.connection.open() as session:
+            return collect_with_progress(session, self.connection.arena, self.seconds, "collecting").messages
 
 
 def _move_by_cameras(rig: Rig, file: Path) -> tuple[Rig, dict[str, float]]:

@@ -39,7 +39,7 @@ def set_rig(
     Args:
         session, arena: where the server is reached.
         rig: the rig; its cameras may lack poses.
-        program: the name of the program that asks, such as `calib wand`; the server reports it.
+        program: the name of the program that asks, such as `roundel calibrate wand`; the server reports it.
         timeout_s: for a server to be found.
 
     Returns:

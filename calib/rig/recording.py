@@ -140,7 +140,7 @@ def wand_recording_path(rig: Path) -> Path:
 
 
 def save_wand_recording(path: Path, arena: str, messages: Iterable[Detections]) -> Path | None:
-    """Write detections atomically, in the format of `fusion record`, with capture times as times of arrival.
+    """Write detections atomically, in the format of `roundel record`, with capture times as times of arrival.
 
     Returns:
         the backup of the previous recording at `path`, if there was one.

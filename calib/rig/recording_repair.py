@@ -93,7 +93,7 @@ def repair_recording(path: Path, max_size: int | None = None) -> Repair:
             size = file.seek(0, 2)
             file.seek(0)
             if file.read(len(MAGIC)) != MAGIC:
-                raise ConfigError(f"{path} is not an MCAP recording; give a file that fusion record wrote")
+                raise ConfigError(f"{path} is not an MCAP recording; give a file that roundel record wrote")
             content = _read_content(file)
             if not content.has_footer:
                 _write_index(file, content, max_size)

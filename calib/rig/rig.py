@@ -113,7 +113,7 @@ def save_rig(rig: Rig, path: Path, first_line: str = "") -> Path | None:
         first_line: a comment that precedes it, such as `RigChange.line`.
 
     Returns:
-        the backup of the previous file at `path`, if there was one (`calib undo` restores it).
+        the backup of the previous file at `path`, if there was one (`roundel calibrate undo` restores it).
 
     Raises:
         CalibrationError: a value is not plausible, so that the file could not be read.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`camera_node snapshot` and `camera_node settings`: the image and the settings of a camera that runs."""
+"""`roundel snapshot` and `roundel settings`: the image and the settings of a camera that runs."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -21,19 +21,8 @@ from camera_node.protocol.camera_requests import (
     request_snapshot,
 )
 from camera_node.protocol.messages import Settings
-from camera_node.protocol.server_connection import ServerAddress
-from camera_node.protocol.session import open_client
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from camera_node.sources.frame import parse_controls
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraConnection(ServerAddress):
-    """Where a camera is reached."""
-
-    def open(self) -> Session:
-        """Open a session for requests; raises as `open_client`."""
-        require_name(self.arena, "an arena")
-        return open_client(self.connect, self.zenoh)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,13 +35,13 @@ class SaveSnapshot:
     """The JPEG file to write; an existing file is replaced."""
     draw: bool = False
     """Draw the detected roundels."""
-    server: Annotated[CameraConnection, tyro.conf.OmitArgPrefixes] = field(default_factory=CameraConnection)
+    connection: ConnectionOptions = LOCAL_SERVER
 
     def run(self) -> None:
         """Save the image. Raises NetworkError if the camera does not answer, ConfigError for a bad file name."""
         require_name(self.name, "a camera")
-        with self.server.open() as session:
-            data = request_snapshot(session, self.server.arena, self.name, "draw" if self.draw else "")
+        with self.connection.open() as session:
+            data = request_snapshot(session, self.connection.arena, self.name, "draw" if self.draw else "")
         save_picture(data, self.out)
 
 
@@ -87,14 +76,14 @@ class ChangeSettings:
     """Also ignore a rectangle, by two opposite corners U,V in pixels, or a polygon, by three or more corners."""
     clear_mask: bool = False
     """Ignore no place, except those of --mask and --mask-detected."""
-    server: Annotated[CameraConnection, tyro.conf.OmitArgPrefixes] = field(default_factory=CameraConnection)
+    connection: ConnectionOptions = LOCAL_SERVER
 
     def run(self) -> None:
         """Change the settings and print those in use. Raises NetworkError, RequestError or ConfigError."""
         require_name(self.name, "a camera")
         drawn = (mask_polygon([_read_corner(text) for text in self.mask]),) if self.mask else ()
-        with self.server.open() as session:
-            used = request_settings(session, self.server.arena, self.name)
+        with self.connection.open() as session:
+            used = request_settings(session, self.connection.arena, self.name)
             wanted = Settings(
                 exposure_us=self.exposure_us,
                 gain=self.gain,
@@ -104,7 +93,7 @@ class ChangeSettings:
                 mask=self._changed_mask(session, used, drawn),
             )
             if wanted != Settings():
-                used = request_settings(session, self.server.arena, self.name, wanted)
+                used = request_settings(session, self.connection.arena, self.name, wanted)
         for name, value in msgspec.structs.asdict(used).items():
             if name not in ("version", "mask"):
                 say(f"{name}: {'-' if value is None else value}")
@@ -116,7 +105,7 @@ class ChangeSettings:
         """The whole mask; None if it stays as it is."""
         detected = ()
         if self.mask_detected:
-            detected = mask_of(next_detections(session, self.server.arena, self.name))
+            detected = mask_of(next_detections(session, self.connection.arena, self.name))
         if not (drawn or detected or self.clear_mask):
             return None
         return (*(() if self.clear_mask else used.mask or ()), *drawn, *detected)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`cameras`: lists, renames and forgets the cameras that registered, and shows what one of them refuses."""
+"""`roundel cameras`: lists, renames and forgets the cameras that registered, and shows what one of them refuses."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import msgspec
-import tyro
 
 from camera_node.commands.adjust import save_picture
 from camera_node.foundation.config import require_name
@@ -14,7 +13,7 @@ from camera_node.foundation.terminal import say
 from camera_node.protocol.camera_requests import change_camera, request_cameras, request_snapshot
 from camera_node.protocol.registration import CameraChange, RegisteredCamera
 from camera_node.protocol.requests import RequestSource
-from camera_node.protocol.session import open_client
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 
 USES = {"list": "", "rename": "OLD NEW", "forget": "NAME", "why": "NAME [PICTURE.jpg]"}
 N_ARGUMENTS = {"list": (0,), "rename": (2,), "forget": (1,), "why": (1, 2)}
@@ -25,31 +24,27 @@ def cameras(
     arguments: tuple[str, ...] = (),
     /,
     *,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+    connection: ConnectionOptions = LOCAL_SERVER,
 ) -> int:
     """List, rename or forget the cameras of the running server, or save a picture of what one refuses, and why.
 
     Args:
         action: list; rename OLD NEW, in the rig too; forget NAME; why NAME [PICTURE.jpg].
         arguments: as the action needs them.
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        connection: the arena's server.
     """
     if len(arguments) not in N_ARGUMENTS[action]:
         raise ConfigError(f"{len(arguments)} arguments; use roundel cameras {action} {USES[action]}".rstrip())
-    with open_client(connect, zenoh_config) as session:
+    with connection.open() as session:
         if action == "why":
             name = require_name(arguments[0], "a camera")
             out = Path(arguments[1] if len(arguments) > 1 else f"{name}_why.jpg")
-            save_picture(request_snapshot(session, arena, name, "why"), out)
+            save_picture(request_snapshot(session, connection.arena, name, "why"), out)
             return 0
         registered = (
-            request_cameras(session, arena)
+            request_cameras(session, connection.arena)
             if action == "list"
-            else change_camera(session, arena, _change(action, arguments))
+            else change_camera(session, connection.arena, _change(action, arguments))
         )
     for name, camera in registered.items():
         say(_line(name, camera))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`python -m camera_node detect`: detects roundels in image files."""
+"""`roundel detect`: detects roundels in image files."""
 
 import json
 from collections.abc import Iterator

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`print`: roundels, wands, boards, L-frames and robots at true scale, as PDF or SVG, with the YAML that belongs to
-them."""
+"""`roundel print`: roundels, wands, boards, L-frames and robots at true scale, as PDF or SVG, with the YAML that
+belongs to them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

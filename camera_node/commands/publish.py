@@ -15,6 +15,7 @@ from camera_node.foundation.config import example_file, require_name
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.service import ServiceManager, StopEvent, stopped_by_signals
 from camera_node.protocol.registration import CameraRegistration
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from camera_node.simulation.simulated_camera import SimulatedCamera
 from camera_node.sources.drivers import SourceIdentity, driver_of, identify, is_simulation
 from camera_node.sources.frame import Source, SourceSettings, is_url
@@ -40,12 +41,7 @@ class Publish:
     video file; a folder of <t_ns>.png|jpg; or sim, or sim:NAME for a camera of the scene."""
     name: str | None = None
     """The camera's name in the arena and in rig.yaml, such as cam0; the server's choice unless given."""
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Zenoh endpoints of the server."""
-    arena: str = "arena"
-    """The arena's name, the first part of all Zenoh keys."""
-    zenoh: Path | None = None
-    """A Zenoh configuration file (JSON5) for TLS, access control or scouting."""
+    connection: ConnectionOptions = LOCAL_SERVER
     detector: Literal["chords", "paper"] = "chords"
     """The search method; paper is the reference method of Faigl et al., ICRA 2013."""
     inner_ratios: tuple[float, ...] = ()
@@ -73,7 +69,7 @@ class Publish:
                     self._publish_registered(session, identity, first_t_ns, stop)
 
     def _check(self) -> None:
-        require_name(self.arena, "an arena")
+        require_name(self.connection.arena, "an arena")
         if self.name is not None:
             require_name(self.name, "a camera")
         elif self.listen:
@@ -96,11 +92,10 @@ class Publish:
 
     def _open_session(self, stop: StopEvent) -> "zenoh.Session | None":
         """Wait for the server, if there is to be one; the service is ready while it waits. None once `stop` is set."""
-        from camera_node.protocol.server_connection import ServerConnection
         from camera_node.protocol.session import open_router
 
         if self.listen:
-            return open_router(self.listen, self.zenoh)
+            return open_router(self.listen, self.connection.zenoh)
         with contextlib.ExitStack() as stack:
             service = stack.enter_context(ServiceManager())
 
@@ -109,7 +104,7 @@ class Publish:
                 service.report("waits for a server")
                 service.progress()
 
-            session = ServerConnection(self.connect, self.zenoh).wait_unless(stop, report)
+            session = self.connection.wait().wait_unless(stop, report)
             if session is not None:
                 stack.pop_all()  # the service goes on
             return session
@@ -130,7 +125,7 @@ class Publish:
             name=identity.name,
             first_t_ns=first_t_ns,
         )
-        registration = Registration(session, self.arena, request)
+        registration = Registration(session, self.connection.arena, request)
         if (assignment := registration.ask(stop)) is None:
             return
         arena_time = ArenaTime.of(assignment)
@@ -146,7 +141,9 @@ class Publish:
     def _node(self, name: str, source: Source, session: "zenoh.Session", keep_stamps: bool) -> "Node":
         from camera_node.node.node import Node, NodeOptions
 
-        options = NodeOptions(self.arena, keep_stamps, self.relative.localizer(name), bool(self.listen))
+        options = NodeOptions(
+            self.connection.arena, keep_stamps, self.relative.localizer(name), bool(self.listen)
+        )
         return Node(name, source, self._detector(), session, options)
 
     def _detector(self) -> "Detector":

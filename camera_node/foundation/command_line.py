@@ -1,24 +1,161 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Reads the command lines of all programs with tyro, and states a mistake in them in one line instead of a box."""
+"""The table of commands, and how a command line is read and run.
+
+Each program lists its commands as `Command` records in its folder `commands`; `roundel` joins the lists. A command's
+module is imported when it runs: a camera's computer has neither GTSAM nor Viser, and lists of commands appear at once.
+tyro reads the options; a mistake in them is one line instead of its box.
+"""
 
 import contextlib
 import difflib
 import functools
 import inspect
 import io
+import logging
+import os
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import requires
 from typing import Any
+
+# Before NumPy is loaded: threads of a BLAS wait for each other longer than the products of small matrices take.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import tyro
 
 from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.logs import set_up_logging
 
 EDGE = re.compile(r"^[│╭╰]\s?|\s*[│╮╯]$", re.MULTILINE)  # of the boxes that tyro prints
 RULE = re.compile(r"\n\s*─+\s*\n")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 ENTRY = re.compile(r"^ {4}(\S.*)\n((?: {5,}.*\n?)*)", re.MULTILINE)  # a missing option and its help
 NUMBER = re.compile(r"(?:invalid literal for int\(\) with base 10|could not convert string to float): (.*)")
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command, or a group of commands.
+
+    Attributes:
+        name: the word on the command line.
+        summary: what it does, in one line.
+        target: its dataclass with a method `run`, or its function, as `module:name`; or the commands of the group.
+        examples: complete command lines.
+        group: the heading under which it is listed.
+        log_level: of its log on stderr.
+    """
+
+    name: str
+    summary: str
+    target: "str | tuple[Command, ...]"
+    examples: tuple[str, ...] = ()
+    group: str = ""
+    log_level: int = logging.INFO
+
+    def run(self, arguments: Sequence[str], prog: str) -> int | None:
+        """Run it, or the command of the group that the arguments name.
+
+        Args:
+            arguments: the command line after this command.
+            prog: this command's full name in its help and in errors.
+
+        Raises:
+            RoundelError: as the command does; ConfigError for a mistake in the command line or a missing package.
+        """
+        if not isinstance(self.target, str):
+            return run_one_of(self.target, arguments, prog, functools.partial(self._list_group, prog))
+        set_up_logging(self.log_level)
+        module, name = self.target.split(":")
+        try:
+            return run_command(getattr(import_module(module), name), prog, arguments, self.examples)
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if (extra := _extra_of(package)) is None:
+                raise
+            raise ConfigError(
+                f"{prog} needs {package}, which a camera's machine does not; pip install 'roundel[{extra}]'"
+            ) from None
+
+    def _list_group(self, prog: str) -> str:
+        assert not isinstance(self.target, str)
+        return list_commands(
+            self.target, prog, f"{self.summary[0].upper()}{self.summary[1:]}.", self.examples
+        )
+
+
+def run_program(
+    commands: Sequence[Command], arguments: Sequence[str], default: Command, prog: str
+) -> int | None:
+    """Run the command that the first argument names, or `default`, of the name `prog`, with all of them."""
+    command = find_command(commands, arguments, "--help lists the options")
+    if command is None:
+        return default.run(arguments, prog)
+    return command.run(arguments[1:], f"roundel {command.name}")
+
+
+def run_one_of(
+    commands: Sequence[Command], arguments: Sequence[str], prog: str, overview: Callable[[], str]
+) -> int | None:
+    """Run the command that the first argument names; return its exit code.
+
+    Args:
+        commands: to choose from.
+        arguments: the command line without the program.
+        prog: the program's name in help and in errors.
+        overview: the text of `--help`.
+
+    Raises:
+        RoundelError: as the command does; ConfigError if there is none of that name.
+    """
+    if arguments and arguments[0] in ("-h", "--help"):
+        print(overview())
+        return 0
+    remedy = f"{prog} --help lists the commands"
+    if (command := find_command(commands, arguments, remedy)) is not None:
+        return command.run(arguments[1:], f"{prog} {command.name}")
+    if arguments:
+        raise ConfigError(f"{arguments[0]} needs a command before it; {remedy}")
+    raise ConfigError(f"{prog} needs a command, such as {commands[0].name}; {remedy}")
+
+
+def find_command(commands: Sequence[Command], arguments: Sequence[str], remedy: str) -> Command | None:
+    """The command that the first argument names; None where it is an option or missing.
+
+    Raises:
+        ConfigError: there is none of that name; the message has the most similar one, and the remedy.
+    """
+    if not arguments or arguments[0].startswith("-"):
+        return None
+    known = {command.name: command for command in commands}
+    if arguments[0] in known:
+        return known[arguments[0]]
+    similar = difflib.get_close_matches(arguments[0], known, 1)
+    hint = f"did you mean {similar[0]}?" if similar else f"the commands are {', '.join(known)}"
+    raise ConfigError(f"there is no command '{arguments[0]}'; {hint} ({remedy})")
+
+
+def list_commands(commands: Sequence[Command], prog: str, about: str, examples: Sequence[str] = ()) -> str:
+    """The text of `--help` of a group: its commands under their headings, each with a summary."""
+    width = max(len(command.name) for command in commands)
+    lines = [f"usage: {prog} COMMAND [OPTIONS]", "", about]
+    for group in dict.fromkeys(command.group for command in commands):
+        rows = [f"  {c.name:{width}}  {c.summary}" for c in commands if c.group == group]
+        lines += ["", f"{group}:", *rows]
+    if examples:
+        lines += ["", "Examples:", *(f"  {example}" for example in examples)]
+    return "\n".join([*lines, "", f"{prog} COMMAND --help shows options and examples."])
+
+
+def _extra_of(package: str) -> str | None:
+    """The extra that installs a package; None if none does."""
+    for requirement in requires("roundel") or ():
+        name, extra = re.match(r"[\w-]+", requirement), re.search(r"extra == ['\"](\w+)", requirement)
+        if name and extra and name[0] == package:
+            return extra[1]
+    return None
 
 
 def parse(kind: Any, prog: str, arguments: Sequence[str], examples: Sequence[str] = ()) -> Any:

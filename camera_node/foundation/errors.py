@@ -16,8 +16,6 @@ Every message names the fault, its place and the remedy. Faults in live data are
 The exit code tells a service manager whether to retry: 2 stays until a user acts, 75 (EX_TEMPFAIL) may pass by itself.
 """
 
-import difflib
-from collections.abc import Sequence
 from typing import ClassVar
 
 USER_ERROR, TEMPORARY_FAILURE = 2, 75  # exit codes; the second is EX_TEMPFAIL of sysexits.h
@@ -52,17 +50,6 @@ class AddressError(NetworkError):
     """An address to listen on is taken, or its network is not up."""
 
     exit_code = TEMPORARY_FAILURE
-
-
-def check_command(
-    arguments: Sequence[str], known: Sequence[str], remedy: str = "--help lists the options"
-) -> None:
-    """Raise ConfigError where the first argument is not an option and not a known command."""
-    if not arguments or arguments[0].startswith("-") or arguments[0] in known:
-        return
-    similar = difflib.get_close_matches(arguments[0], known, 1)
-    hint = f"did you mean {similar[0]}?" if similar else f"the commands are {', '.join(known)}"
-    raise ConfigError(f"there is no command '{arguments[0]}'; {hint} ({remedy})")
 
 
 def printable(text: object, limit: int = MAX_LINE) -> str:

@@ -25,7 +25,7 @@ CUT_MM = 4.0  # length of cut marks
 MARKER_RATIO, DICTIONARY = (
     0.75,
     cv2.aruco.DICT_4X4_1000,
-)  # of boards; the defaults of `calib intrinsics --board`
+)  # of boards; the defaults of `roundel calibrate intrinsics --board`
 
 
 @dataclass(frozen=True)

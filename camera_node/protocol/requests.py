@@ -55,7 +55,7 @@ class RequestSource(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, program: str) -> "RequestSource":
-        """This machine and user, with a program such as `calib wand`."""
+        """This machine and user, with a program such as `roundel calibrate wand`."""
         try:
             user = getpass.getuser()
         except (KeyError, OSError):  # the user's number has no name

@@ -9,9 +9,13 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 import zenoh
+from zenoh import Session  # in a class with a field `zenoh`
 
+from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.session import NO_SERVER, PATIENCE_S, guarded, open_client, open_endless
 
@@ -19,7 +23,6 @@ log = logging.getLogger("camera_node.network")
 
 FIRST_S = 0.5  # in which the session opens if the server runs, and invalid endpoints are found
 WAIT_S = 0.2  # between two looks at whether a session is open
-LOCAL = ("tcp/127.0.0.1:7447",)
 SCOUT_S = 1.5  # scouting repeats its question after 1 s
 CONNECT_S = 2.0  # to one router that was found
 MAX_ROUTERS = 16
@@ -157,18 +160,6 @@ class _Absence:
             log.warning("the server is back")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServerAddress:
-    """The arena's server."""
-
-    connect: tuple[str, ...] = LOCAL
-    """Zenoh endpoints of the server."""
-    arena: str = "arena"
-    """The arena's name."""
-    zenoh: Path | None = None
-    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
-
-
 @dataclass(frozen=True, slots=True)
 class FoundArena:
     """An arena, and the endpoints at which its server is reached."""
@@ -218,3 +209,37 @@ def _scout(timeout_s: float) -> list[tuple[str, ...]]:
     threading.Event().wait(timeout_s)
     scout.stop()
     return [endpoints for endpoints in routers.values() if endpoints]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Connection:
+    """The arena's server: the options by which every command reaches it."""
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Zenoh endpoints of the server."""
+    arena: str = "arena"
+    """The arena's name, as in the server's configuration."""
+    zenoh: Path | None = None
+    """A Zenoh configuration (JSON5) for TLS, access control or scouting."""
+
+    def open(self) -> Session:
+        """Open a session with a server that runs; raises as `open_client`, and ConfigError for a bad name."""
+        require_name(self.arena, "an arena")
+        return open_client(self.connect, self.zenoh)
+
+    def wait(self) -> ServerConnection:
+        """A session that opens as soon as the server answers; raises as `ServerConnection`."""
+        return ServerConnection(self.connect, self.zenoh)
+
+    def options(self) -> list[str]:
+        """The options that differ from their defaults, as words of a command line."""
+        words = []
+        if self.connect != LOCAL_SERVER.connect:
+            words += ["--connect", *self.connect]
+        if self.arena != LOCAL_SERVER.arena:
+            words += ["--arena", self.arena]
+        return words + (["--zenoh", str(self.zenoh)] if self.zenoh is not None else [])
+
+
+ConnectionOptions = Annotated[Connection, tyro.conf.arg(name="")]  # as --connect, not --connection.connect
+LOCAL_SERVER = Connection()

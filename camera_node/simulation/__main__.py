@@ -17,7 +17,7 @@ from camera_node.simulation.simulated_camera import render_recording
 
 def main() -> None:
     """The entry point of the command."""
-    run(lambda: run_command(simulate, "python -m camera_node.simulation", sys.argv[1:]))
+    run(lambda: run_command(simulate, "roundel simulate", sys.argv[1:]))
 
 
 def simulate(

@@ -38,7 +38,7 @@ def serving(host: str, port: int, name: str) -> Iterator[tuple[FoxgloveChannels,
         AddressError: another program uses the port, or the address is none of this machine.
         ConfigError: foxglove-sdk is missing.
     """
-    foxglove = require("foxglove", "foxglove", "fusion foxglove")
+    foxglove = require("foxglove", "foxglove", "roundel foxglove")
     context = foxglove.Context()
     try:
         server = foxglove.start_server(name=name, host=host, port=port, context=context)

@@ -95,7 +95,7 @@ class MavlinkVehicle:
         self.faults: Counter[str] = Counter()
         if not 1 <= system <= 255:
             raise ConfigError(f"--system {system} is none of MAVLink; give a number from 1 to 255")
-        self._mavlink = require("pymavlink.dialects.v20.common", "mavlink", "fusion mavlink")
+        self._mavlink = require("pymavlink.dialects.v20.common", "mavlink", "roundel mavlink")
         self._socket = connect(to)
         self._encoder = self._mavlink.MAVLink(
             None, system, self._mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY

@@ -8,12 +8,8 @@ import socket
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Annotated
 
-import tyro
-
-from camera_node.protocol.server_connection import ServerAddress, ServerConnection
+from camera_node.protocol.server_connection import Connection
 from fusion.client.arena import Arena
 from fusion.client.streams import cause_of_silence
 from fusion.protocol.pose_messages import RobotPose
@@ -91,29 +87,21 @@ class PoseQueue:
                 self._writer.send(b"\0")
 
 
-@dataclass(frozen=True, kw_only=True)
-class PoseServer(ServerAddress):
-    """The server whose poses a bridge sends on."""
+@contextlib.contextmanager
+def receive_poses(connection: Connection, robot: str | None = None) -> Iterator[PoseQueue]:
+    """The poses of all robots of an arena, or of one; what was skipped is logged at the end.
 
-    @contextlib.contextmanager
-    def receive_poses(self, robot: str | None = None) -> Iterator[PoseQueue]:
-        """The poses of all robots, or of one; what was skipped is logged at the end.
-
-        Raises:
-            NetworkError: an endpoint is invalid.
-            ConfigError: the Zenoh configuration is missing or invalid.
-        """
-        with Arena(ServerConnection(self.connect, self.zenoh), self.arena, robot or "*") as client:
-            poses = PoseQueue(client, robot)
-            try:
-                yield poses
-            finally:
-                poses.close()
-                log_faults(poses.faults + client.faults)
-
-
-Server = Annotated[PoseServer, tyro.conf.arg(name="")]
-LOCAL = PoseServer()
+    Raises:
+        NetworkError: an endpoint is invalid.
+        ConfigError: the Zenoh configuration is missing or invalid.
+    """
+    with Arena(connection.wait(), connection.arena, robot or "*") as client:
+        poses = PoseQueue(client, robot)
+        try:
+            yield poses
+        finally:
+            poses.close()
+            log_faults(poses.faults + client.faults)
 
 
 def log_faults(faults: Counter[str]) -> None:

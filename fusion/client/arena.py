@@ -30,7 +30,7 @@ from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, RelativePositions, decode
 from camera_node.protocol.requests import RETRY_S, RequestSource
-from camera_node.protocol.server_connection import LOCAL, ServerConnection
+from camera_node.protocol.server_connection import LOCAL_SERVER, ServerConnection
 from camera_node.protocol.session import ask_server, guarded
 from fusion.client.streams import RelativeStream, RobotStream, Stream
 from fusion.model.robots import Robot as RobotBody
@@ -87,7 +87,7 @@ class Arena:
         Raises:
             NetworkError: an endpoint is invalid.
         """
-        return cls(ServerConnection(endpoints or LOCAL, zenoh_config), arena)
+        return cls(ServerConnection(endpoints or LOCAL_SERVER.connect, zenoh_config), arena)
 
     def __enter__(self) -> "Arena":
         return self

@@ -278,7 +278,7 @@ def define_robot(session: zenoh.Session, arena: str, definition: RobotDefinition
     if definition.centre is not None:
         markers = markers.within(definition.centre, definition.radius_m)
     robot = robot_from_markers(markers, definition.diameter_m, definition.motion)
-    source = RequestSource.of("fusion define")
+    source = RequestSource.of("roundel define")
     request = RobotsRequest(define={definition.name: robot}, replace=definition.replace, source=source)
     return change_robots(session, arena, request)
 

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion define`: measures a robot in the arena, and defines it in the running server."""
+"""`roundel define`: measures a robot in the arena, and defines it in the running server."""
 
-from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
-from camera_node.protocol.session import open_client
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.client.robot_definition import RobotDefinition, define_robot, describe
 
 
@@ -22,9 +19,7 @@ def define(
     motion: Literal["ground", "aerial"] = "aerial",
     seconds: float = 2.0,
     replace: bool = False,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+    connection: ConnectionOptions = LOCAL_SERVER,
 ) -> int:
     """Measure the markers of a stationary robot, and add it to the robots of the running server.
 
@@ -38,14 +33,12 @@ def define(
         motion: how it moves.
         seconds: the duration of the measurement.
         replace: replace the robot of that name; without it, a name in use is refused.
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        connection: the arena's server.
     """
     definition = RobotDefinition(name, diameter, motion, at, within, replace)
     if not 0 < seconds < 3600:
         raise ConfigError(f"--seconds is {seconds:g}; it must be above 0 and below 3600")
-    with open_client(connect, zenoh_config) as session:
-        robots = define_robot(session, arena, definition, seconds)
+    with connection.open() as session:
+        robots = define_robot(session, connection.arena, definition, seconds)
     say(describe(name, robots))
     return 0

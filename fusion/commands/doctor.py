@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion doctor`: checks a machine, the files of an arena and a running server, and says what to do."""
+"""`roundel doctor`: checks a machine, the files of an arena and a running server, and says what to do."""
 
 from collections.abc import Iterator
 from datetime import UTC, datetime

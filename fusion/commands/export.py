@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion export`: a recording in the formats of other programs."""
+"""`roundel export`: a recording in the formats of other programs."""
 
 from pathlib import Path
 from typing import Literal
@@ -41,7 +41,7 @@ def export(
     """Write the poses of a recording (MCAP) in the format of another program.
 
     Args:
-        recording: the MCAP file of fusion record or fusion replay.
+        recording: the MCAP file of roundel record or roundel replay.
         out: the file to write: .c3d, .trc, .csv, .tum, or .mcap for Foxglove; without suffix a ROS 2 bag, a folder.
         format: the format, if the suffix does not say it.
         robots: names of the robots to write; all unless given.

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion health`: the state of a running arena in one line and an exit code, for people and monitoring systems."""
+"""`roundel health`: the state of a running arena in one line and an exit code, for people and monitoring systems."""
 
 import json as json_format
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Annotated
 
 import msgspec
-import tyro
 
 from camera_node.foundation.terminal import say
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.client.arena import Arena
 from fusion.protocol.arena_health import assess_health
 
@@ -18,9 +16,7 @@ HEALTHY, ATTENTION = 0, 1  # exit codes; 2 where no server answers
 
 def health(
     *,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+    connection: ConnectionOptions = LOCAL_SERVER,
     timeout_s: float = 5.0,
     json: bool = False,
 ) -> int:
@@ -29,13 +25,11 @@ def health(
     The exit code is 0 for a healthy arena, 1 if something needs attention, and 2 if no server answers.
 
     Args:
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        connection: the arena's server.
         timeout_s: how long to wait for the server, seconds.
         json: print one JSON object with all problems.
     """
-    with Arena.connect(*connect, arena=arena, zenoh_config=zenoh_config) as client:
+    with Arena(connection.wait(), connection.arena) as client:
         status, rig = client.status(timeout_s).next(), client.rig(timeout_s)
     state = assess_health(status, rig, datetime.now(UTC))
     if json:

@@ -1,40 +1,33 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion history`, `fusion undo` and `fusion redo`: list the versions of the running server's rig, and step through
+"""`roundel history`, `roundel undo` and `roundel redo`: list the versions of the running server's rig, and step through
 them."""
 
 from collections.abc import Callable
 from datetime import datetime
-from pathlib import Path
-from typing import Annotated
 
-import tyro
 import zenoh
 
 from calib.live.rig_requests import redo_rig, request_rig, request_rig_history, undo_rig
 from calib.rig.messages import RigMessage, RigVersion
 from camera_node.foundation.errors import printable
 from camera_node.foundation.terminal import say
-from camera_node.protocol.session import open_client
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.model.corrections import corrected_camera
 
 
 def history(
     *,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+    connection: ConnectionOptions = LOCAL_SERVER,
 ) -> int:
     """List the versions of the running server's rig, oldest first: when each was made, by whom, and what it changed.
 
     An undo restores the line above the one in force, a redo the line below.
 
     Args:
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        connection: the arena's server.
     """
-    with open_client(connect, zenoh_config) as session:
-        versions = request_rig_history(session, arena).versions
+    with connection.open() as session:
+        versions = request_rig_history(session, connection.arena).versions
     for version in versions:
         say(_line(version))
     if not versions:
@@ -52,46 +45,38 @@ def _line(version: RigVersion) -> str:
 
 def undo(
     *,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+    connection: ConnectionOptions = LOCAL_SERVER,
 ) -> int:
     """Undo the last change of the running server's rig: a calibration, or its recalibration of a moved camera.
 
     A camera whose recalibration is undone is no longer monitored.
 
     Args:
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        connection: the arena's server.
     """
-    with open_client(connect, zenoh_config) as session:
-        say(_step(session, arena, undo_rig, "previous"))
+    with connection.open() as session:
+        say(_step(session, connection.arena, undo_rig, "previous"))
     return 0
 
 
 def redo(
     *,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+    connection: ConnectionOptions = LOCAL_SERVER,
 ) -> int:
     """Redo the change of the running server's rig that was undone last.
 
     Args:
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        connection: the arena's server.
     """
-    with open_client(connect, zenoh_config) as session:
-        say(_step(session, arena, redo_rig, "undone"))
+    with connection.open() as session:
+        say(_step(session, connection.arena, redo_rig, "undone"))
     return 0
 
 
 def _step(session: zenoh.Session, arena: str, step: Callable[..., RigMessage], word: str) -> str:
     """Change the server's rig; returns a sentence about the result."""
     before = request_rig(session, arena)
-    after = step(session, arena, f"fusion {step.__name__.removesuffix('_rig')}").rig
+    after = step(session, arena, f"roundel {step.__name__.removesuffix('_rig')}").rig
     old = before.cameras if before else {}
     changed = [name for name in {**old, **after.cameras} if old.get(name) != after.cameras.get(name)]
     text = f"the {word} rig is in force on the server; changed cameras: {', '.join(changed) or 'none'}"

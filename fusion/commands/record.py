@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion record`: a live arena into an MCAP file."""
+"""`roundel record`: a live arena into an MCAP file."""
 
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from calib.rig.recording import RecordingWriter
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
-from camera_node.protocol.server_connection import ServerConnection
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.recordings.arena_recording import ArenaRecorder
 from fusion.recordings.rotation import RotatingWriter, Rotation
 
@@ -18,9 +15,7 @@ def record(
     out: Path,
     /,
     *,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+    connection: ConnectionOptions = LOCAL_SERVER,
     seconds: float | None = None,
     rotate_mb: float | None = None,
     rotate_minutes: float | None = None,
@@ -30,9 +25,7 @@ def record(
 
     Args:
         out: the MCAP file to write.
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        connection: the arena's server.
         seconds: the duration; until Ctrl-C or SIGTERM unless given.
         rotate_mb: begin the next file, OUT-001.mcap, OUT-002.mcap and so on, at this size, megabytes.
         rotate_minutes: begin the next file after this time, minutes.
@@ -43,9 +36,9 @@ def record(
     with (
         stopped_by_signals() as stop,
         opened as writer,
-        ServerConnection(connect, zenoh_config) as connection,
+        connection.wait() as waiting,
     ):
-        recorder = ArenaRecorder(connection, arena, writer)
+        recorder = ArenaRecorder(waiting, connection.arena, writer)
         recorder.run(stop, seconds)
     for key, count in sorted(writer.counts.items()):
         say(f"{count:7} on {key}")
@@ -54,7 +47,8 @@ def record(
     say(f"wrote {writer.path}")
     if not writer.counts:
         say(
-            f"warning: the recording is empty: no message of arena '{arena}' arrived from {' '.join(connect)}"
+            f"warning: the recording is empty: no message of arena '{connection.arena}' arrived from "
+            f"{' '.join(connection.connect)}"
         )
         return 1
     return 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion recordings`: lists, renames and removes the recordings of a folder."""
+"""`roundel recordings`: lists, renames and removes the recordings of a folder."""
 
 from pathlib import Path
 from typing import Literal

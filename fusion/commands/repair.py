@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion repair`: makes a recording that was cut off readable by every MCAP reader."""
+"""`roundel repair`: makes a recording that was cut off readable by every MCAP reader."""
 
 import shutil
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion replay`: a recording (MCAP) into `poses.csv` or another recording."""
+"""`roundel replay`: a recording (MCAP) into `poses.csv` or another recording."""
 
 from pathlib import Path
 

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion robots`: lists, renames, removes, turns, moves the pivot of and saves the robots of the running server."""
+"""`roundel robots`: lists, renames, removes, turns, moves the pivot of and saves the robots of the running server."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
 import zenoh
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestSource
-from camera_node.protocol.session import open_client
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.client.robot_definition import LOST_AT_RESTART
 from fusion.model.robots import Robot, move_origin, save_robots, turn_heading
 from fusion.protocol.pose_messages import Robots, RobotsRequest
@@ -41,9 +40,7 @@ def robots(
     /,
     *,
     force: bool = False,
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",),
-    arena: str = "arena",
-    zenoh_config: Annotated[Path | None, tyro.conf.arg(name="zenoh")] = None,
+    connection: ConnectionOptions = LOCAL_SERVER,
 ) -> int:
     """List, rename or remove the robots of the running server, change their frames, or save them in a file.
 
@@ -53,17 +50,15 @@ def robots(
             this machine.
         arguments: as the action needs them.
         force: save overwrites the file.
-        connect: the server's Zenoh endpoints.
-        arena: the arena's name.
-        zenoh_config: a Zenoh configuration (JSON5) for TLS, access control or scouting.
+        connection: the arena's server.
     """
     counts = COUNTS[action]
     if not counts[0] <= len(arguments) <= counts[1]:
-        raise ConfigError(f"{len(arguments)} arguments; use fusion robots {action} {USES[action]}".rstrip())
+        raise ConfigError(f"{len(arguments)} arguments; use roundel robots {action} {USES[action]}".rstrip())
     if action == "save" and Path(arguments[0]).exists() and not force:
         raise ConfigError(f"{arguments[0]} exists; add --force to overwrite it, or name another file")
-    with open_client(connect, zenoh_config) as session:
-        after = _apply(session, arena, action, arguments)
+    with connection.open() as session:
+        after = _apply(session, connection.arena, action, arguments)
     if action == "save":
         save_robots(after.robots, Path(arguments[0]))
         say(f"wrote {len(after.robots)} robots to {arguments[0]}")
@@ -78,7 +73,7 @@ def robots(
 
 
 def _apply(session: zenoh.Session, arena: str, action: str, arguments: tuple[str, ...]) -> Robots:
-    program = f"fusion robots {action}"
+    program = f"roundel robots {action}"
     source = RequestSource.of(program)
     if action == "rename":
         names = {arguments[0]: arguments[1]}

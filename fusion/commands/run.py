@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion run`: frames or observations into `poses.csv`."""
+"""`roundel run`: frames or observations into `poses.csv`."""
 
 from pathlib import Path
 

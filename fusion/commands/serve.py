@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion`: the live server."""
+"""`roundel server`: the live server."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,10 +12,7 @@ from camera_node.foundation.service import stopped_by_signals
 class Serve:
     """Fuse what an arena's cameras publish into robot poses, until stopped; this is the arena's Zenoh router.
 
-    Other commands, python -m fusion NAME --help: health and doctor report on a running arena and say what to do;
-    run, record, replay and repair are for recordings; define measures a new robot in the arena; robots lists,
-    renames, removes and saves them; undo and redo step through the changes of the rig; ros2 publishes the robots to
-    ROS 2.
+    roundel --help lists the other commands, such as health and doctor, which report on a running arena.
     """
 
     config: Path | None = None

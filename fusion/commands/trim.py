@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion trim`: a part of a recording as a recording."""
+"""`roundel trim`: a part of a recording as a recording."""
 
 from pathlib import Path
 

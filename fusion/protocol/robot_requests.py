@@ -47,7 +47,7 @@ def reframe_robot(
 ) -> Robots:
     """Replace a robot by `change` of it, such as `fusion.model.robots.move_origin`; it is acquired again.
 
-    `program` asks for it, such as "fusion robots turn", for the server's audit.
+    `program` asks for it, such as "roundel robots turn", for the server's audit.
 
     Raises:
         FusionError: there is no such robot, or it can not be changed so.

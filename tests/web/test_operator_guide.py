@@ -39,7 +39,7 @@ COMMAND_TESTS = {
     "calibrate apply": ("tests/fusion/server/test_rig_changes.py", '"apply"'),
     "calibrate wand": ("tests/web/roundel/test_up.py", '"--live"'),
     "calibrate world": ("tests/calib/commands/test_command_line.py", '"world"'),
-    "history": ("tests/fusion/server/storage/test_active_rig.py", "history(connect"),
+    "history": ("tests/fusion/server/storage/test_active_rig.py", "history(connection"),
     "undo": ("tests/fusion/server/storage/test_active_rig.py", '"undo"'),
     "redo": ("tests/fusion/server/storage/test_active_rig.py", '"redo"'),
     "robots list": ("tests/fusion/model/test_robot_frame.py", 'robots("list"'),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-from camera_node.foundation.config import shipped_path
+from camera_node.foundation.config import example_file, shipped_path
 from camera_node.foundation.errors import ConfigError
 
 
@@ -33,29 +33,16 @@ class RunDemo:
 
     def run(self) -> int:
         """Run the demo and return its exit code."""
-        if self.relative:
-            return self._run_formation()
-        from web.__main__ import Options, play_demo
-
-        return play_demo(
-            Options(
-                demo=True,
-                headless=self.headless,
-                seconds=self.seconds,
-                host=self.host,
-                port=self.port,
-                scene=self.scene,
-                listen=self.listen,
-            )
-        )
-
-    def _run_formation(self) -> int:
         from web.view import check_port
 
-        if self.scene is not None:
+        if self.relative and self.scene is not None:
             raise ConfigError("--scene is not for --relative, whose robots move by themselves")
         if not self.headless:
             check_port(self.host, self.port)
         page = None if self.headless else (self.host, self.port)
-        sys.path.append(str(shipped_path("examples")))
-        return import_module("formation.live_formation").run_formation(self.listen, page, self.seconds)
+        if self.relative:
+            sys.path.append(str(shipped_path("examples")))
+            return import_module("formation.live_formation").run_formation(self.listen, page, self.seconds)
+        from web.demo.demo import run_demo
+
+        return run_demo(self.scene or example_file("demo/scene.yaml"), self.listen, page, self.seconds)

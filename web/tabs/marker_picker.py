@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Defines a new robot from markers that the user selects in the page; `python -m fusion define` does so without one."""
+"""Defines a new robot from markers that the user selects in the page; `roundel define` does so without one."""
 
 import numpy as np
 import viser

@@ -41,7 +41,7 @@ RECORDING_COLUMNS = (
 
 
 class Recorder:
-    """Records the arena into a new file of a folder; `python -m fusion record` does so without a page."""
+    """Records the arena into a new file of a folder; `roundel record` does so without a page."""
 
     def __init__(self, gui: viser.GuiApi, subscription: Subscription, folder: Path) -> None:
         self._subscription, self._folder = subscription, folder

@@ -74,7 +74,7 @@ class ReplayControls:
         """Write the part that is played as a recording of its own, beside the recording.
 
         Raises:
-            WebError: it can't be written; the message is that of `fusion trim`.
+            WebError: it can't be written; the message is that of `roundel trim`.
         """
         player = self.player
         if player is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Calibrates the cameras from the page with a wand; `python -m calib wand --live` does so in a terminal."""
+"""Calibrates the cameras from the page with a wand; `roundel calibrate wand --live` does so in a terminal."""
 
 import tempfile
 import threading
@@ -32,7 +32,7 @@ from web.state.subscription import Subscription
 from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
 from web.widgets import ActionButton, Answer, LongAction, set_content
 
-SOLVE_S = 600.0  # limit for `calib wand`
+SOLVE_S = 600.0  # limit for `roundel calibrate wand`
 CLOSE_S = 5.0  # for the recording to be saved when the page closes
 WAND_COLUMNS = (
     Column("camera"),
@@ -178,7 +178,7 @@ class WandSessionPanel:
 
 
 def calibrate_cameras(recording: Path, files: CalibrationFiles) -> None:
-    """Run `calib wand` on a recording, in its own process because GTSAM holds the GIL; it writes the
+    """Run `roundel calibrate wand` on a recording, in its own process because GTSAM holds the GIL; it writes the
     candidate file.
 
     Raises:
@@ -188,7 +188,7 @@ def calibrate_cameras(recording: Path, files: CalibrationFiles) -> None:
 
 
 def recalibrate_one(recording: Path, files: CalibrationFiles, rig: Rig, name: str) -> None:
-    """Like `calibrate_cameras`, for one camera of a rig: `calib wand --only`."""
+    """Like `calibrate_cameras`, for one camera of a rig: `roundel calibrate wand --only`."""
     with tempfile.TemporaryDirectory(prefix="roundel-rig-") as folder:
         path = Path(folder) / "rig.yaml"
         save_rig(rig, path)
@@ -214,7 +214,7 @@ def describe_move(before: Rig, after: Rig, name: str) -> str:
 
 
 def describe_calibration(calibration: dict[str, Any]) -> str:
-    """Describe the quality of a calibration that `calib wand` wrote, with instructions for the user."""
+    """Describe the quality of a calibration that `roundel calibrate wand` wrote, with instructions for the user."""
     text = calibration.get("because", "the cameras are calibrated")
     if expected := calibration.get("expected_mm"):
         text += f"; expected error {expected['median']:.1f} mm, at most {expected['worst']:.1f} mm"

@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion foxglove`: an arena live in Foxglove."""
+"""`roundel foxglove`: an arena live in Foxglove."""
 
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.bridges.foxglove_server import ArenaContent, serving
-from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server
+from fusion.bridges.pose_queue import WAIT_S, receive_poses
 
 
-def foxglove(*, server: Server = LOCAL, host: str = "127.0.0.1", port: int = 8765) -> int:
+def foxglove(
+    *, connection: ConnectionOptions = LOCAL_SERVER, host: str = "127.0.0.1", port: int = 8765
+) -> int:
     """Serve an arena to Foxglove (Open connection, Foxglove WebSocket), until stopped.
 
     Args:
-        server: the arena's server.
+        connection: the arena's server.
         host: the address to listen on; 0.0.0.0 for Foxglove on other machines. There are no passwords.
         port: of the websocket.
     """
     with (
         stopped_by_signals() as stop,
-        serving(host, port, f"Roundel {server.arena}") as (channels, chosen),
-        server.receive_poses() as poses,
+        serving(host, port, f"Roundel {connection.arena}") as (channels, chosen),
+        receive_poses(connection) as poses,
         ArenaContent(poses.client, channels),
     ):
         say(f"Foxglove at ws://{host}:{chosen}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion mavlink`: one robot's poses to its autopilot."""
+"""`roundel mavlink`: one robot's poses to its autopilot."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -10,9 +10,10 @@ from camera_node.foundation.config import require_name
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
 from camera_node.node.clock_sync import ClockSync
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.bridges.mavlink_frames import FrdFrames
 from fusion.bridges.mavlink_vehicle import MavlinkBridge, MavlinkVehicle, RateDivider
-from fusion.bridges.pose_queue import LOCAL, Server, log_faults
+from fusion.bridges.pose_queue import log_faults, receive_poses
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def mavlink(
     robot: tyro.conf.Positional[str],
     *,
     to: str,
-    server: Server = LOCAL,
+    connection: ConnectionOptions = LOCAL_SERVER,
     message: Literal["odometry", "vision"] = "odometry",
     rate_hz: float = 50.0,
     vehicle: Annotated[VehicleOptions, tyro.conf.arg(name="")] = DEFAULTS,
@@ -46,7 +47,7 @@ def mavlink(
     Args:
         robot: its name in the arena.
         to: the autopilot or a MAVLink router, as udp:HOST:PORT.
-        server: the arena's server.
+        connection: the arena's server.
         message: odometry has velocity; vision is VISION_POSITION_ESTIMATE.
         rate_hz: messages a second at most.
         vehicle: its number, and where MAVLink's frames are in the arena.
@@ -57,7 +58,7 @@ def mavlink(
     with (
         stopped_by_signals() as stop,
         MavlinkVehicle(to, vehicle.system) as autopilot,
-        server.receive_poses(robot) as poses,
+        receive_poses(connection, robot) as poses,
     ):
         bridge = MavlinkBridge(autopilot, converter, rate, message)
         poses.client.status().on_message(bridge.resets.add_status)

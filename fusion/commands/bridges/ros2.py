@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`fusion ros2`: an arena's robots as topics of ROS 2."""
+"""`roundel ros2`: an arena's robots as topics of ROS 2."""
 
 import os
 
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
-from camera_node.protocol.server_connection import ServerConnection
+from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions, ServerConnection
 from camera_node.protocol.session import BURST_BUFFER
-from fusion.bridges.pose_queue import LOCAL, WAIT_S, Server, log_faults
+from fusion.bridges.pose_queue import WAIT_S, log_faults, receive_poses
 from fusion.bridges.ros2_node import Ros2Node, parse_domain, parse_namespace
 
 
 def ros2(
     *,
-    server: Server = LOCAL,
+    connection: ConnectionOptions = LOCAL_SERVER,
     ros: tuple[str, ...] | None = None,
     domain: int | None = None,
     namespace: str = "",
@@ -24,7 +24,7 @@ def ros2(
     """Publish an arena's robots to ROS 2, for nodes that run with RMW_IMPLEMENTATION=rmw_zenoh_cpp, until stopped.
 
     Args:
-        server: the arena's server.
+        connection: the arena's server.
         ros: endpoints of ROS 2's own Zenoh router (rmw_zenohd), if the nodes do not use the server's.
         domain: ROS 2's domain; that of ROS_DOMAIN_ID, or 0, unless given.
         namespace: prefix of the robots' topics, such as lab1.
@@ -36,10 +36,12 @@ def ros2(
     prefix = parse_namespace(namespace)
     with (
         stopped_by_signals() as stop,
-        server.receive_poses() as poses,
-        ServerConnection(ros or server.connect, None if ros else server.zenoh, BURST_BUFFER) as connection,
+        receive_poses(connection) as poses,
+        ServerConnection(
+            ros or connection.connect, None if ros else connection.zenoh, BURST_BUFFER
+        ) as router,
     ):
-        if (session := connection.wait_unless(stop)) is None:
+        if (session := router.wait_unless(stop)) is None:
             return 0
         node = Ros2Node(session, ros_domain, prefix, humble)
         say(f"ROS 2, domain {ros_domain}")

@@ -61,16 +61,16 @@ def test_a_suggested_plan_can_be_evaluated(tmp_path: Path, monkeypatch: pytest.M
     for name, value in {"PLACES": 6, "AIMS": 3, "STARTS": 1, "SWEEPS": 1, "EVALUATIONS": 10}.items():
         monkeypatch.setattr(placement, name, value)
     out = tmp_path / "suggested.yaml"
-    parse(PlanArena, "roundel plan", [str(SHIPPED), "--suggest", "2", "--out", str(out)]).execute()
+    parse(PlanArena, "roundel plan", [str(SHIPPED), "--suggest", "2", "--out", str(out)]).run()
     said = capsys.readouterr().out.splitlines()
     assert said[1].startswith("camera-2: at ")
     assert set(load_yaml(out, Plan).cameras) == {"camera-1", "camera-2"}
-    parse(PlanArena, "roundel plan", [str(out)]).execute()
+    parse(PlanArena, "roundel plan", [str(out)]).run()
     assert capsys.readouterr().out.splitlines() == said[3:]
 
 
 def test_the_catalogue_is_listed(capsys: pytest.CaptureFixture[str]):
-    parse(PlanArena, "roundel plan", ["--catalogue"]).execute()
+    parse(PlanArena, "roundel plan", ["--catalogue"]).run()
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(CATALOGUE)
 
@@ -88,4 +88,4 @@ def test_the_catalogue_is_listed(capsys: pytest.CaptureFixture[str]):
 def test_mistakes_are_named(options: tuple, message: str):
     """Before any work; `camera_node.foundation.errors.run` makes one line and exit code 2 of them."""
     with pytest.raises(ConfigError, match=re.escape(message)):
-        parse(PlanArena, "roundel plan", [str(option) for option in options]).execute()
+        parse(PlanArena, "roundel plan", [str(option) for option in options]).run()

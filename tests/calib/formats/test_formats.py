@@ -319,12 +319,12 @@ def test_an_exported_rig_is_read_back(tmp_path: Path, name: FormatName):
     coefficients."""
     truth = ring(3).truth
     save_rig(truth, tmp_path / "rig.yaml")
-    ExportRig(format=name, rig=tmp_path / "rig.yaml", out=tmp_path / "there").execute()
+    ExportRig(format=name, rig=tmp_path / "rig.yaml", out=tmp_path / "there").run()
     folder = tmp_path / "there"
     files = (
         (folder,) if name == "multicamselfcal" else tuple(p for p in folder.iterdir() if p.suffix != ".csv")
     )
-    ImportData(format=name, files=files, out=tmp_path / "back").execute()
+    ImportData(format=name, files=files, out=tmp_path / "back").run()
     back = load_rig(tmp_path / "back" / "rig.yaml")
     assert len(back.cameras) == 3
     ahead = np.array([[0.3, -0.2, 1.0], [-0.4, 0.3, 1.0], [0.0, 0.0, 1.0]])
@@ -402,7 +402,7 @@ def test_imported_points_calibrate_a_rig(tmp_path: Path):
     truth, wand = ring(3).truth, WandBody(markers=((0, 0, 0), (LENGTH_M, 0, 0)))
     write_stick(tmp_path, "dltdv")
     table = tmp_path / "xypts.csv"
-    ImportData(format="dltdv", files=(table, tmp_path / "profile.txt"), out=tmp_path).execute()
+    ImportData(format="dltdv", files=(table, tmp_path / "profile.txt"), out=tmp_path).run()
     rig = load_rig(tmp_path / "rig.yaml")
     messages = read_observations(tmp_path / "observations.csv", fps=100.0)
     messages = [msgspec.structs.replace(m, width=800, height=600) for m in messages]

@@ -19,7 +19,6 @@ import pytest
 import zenoh
 
 from calib.__main__ import execute
-from calib.commands.connection import Connection
 from calib.commands.wand import Wand
 from calib.errors import CalibrationError
 from calib.live.collect import CollectedFrames
@@ -36,6 +35,7 @@ from calib.live.wand_session import run_wand_session
 from calib.rig.recording import read_detections
 from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode
+from camera_node.protocol.server_connection import Connection
 from camera_node.protocol.session import open_client, open_router
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import ROOT, free_port
@@ -202,20 +202,22 @@ def test_a_recording_is_saved_and_can_be_calibrated_again_by_the_printed_command
     arena, sent = ring(3), record(ring(3), 6.0)
     save_rig(arena.intrinsics, tmp_path / "lenses.yaml")
     (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.25, 0, 0], [0.5, 0, 0]]}")
-    server = Connection(connect=(endpoint,), arena="test")
+    connection = Connection(connect=(endpoint,), arena="test")
     wand, out = tmp_path / "wand.yaml", tmp_path / "out.yaml"
-    command = Wand(wand=wand, rig=tmp_path / "lenses.yaml", out=out, live=True, seconds=4.0, server=server)
+    command = Wand(
+        wand=wand, rig=tmp_path / "lenses.yaml", out=out, live=True, seconds=4.0, connection=connection
+    )
     with sending(sent, endpoint) as (_, done):
         with pytest.raises(CalibrationError, match="symmetric"):
-            command.execute()
+            command.run()
         done()
     recording = tmp_path / "out.wave.mcap"
     assert sorted(m.t_ns for m in read_detections(recording)) == sorted(m.t_ns for m in sent)
     assert sorted(tmp_path.glob(".*")) == []
-    (printed,) = [line for line in capsys.readouterr().out.splitlines() if "python -m calib" in line]
-    words = shlex.split(printed[printed.index("python -m calib") :])
+    (printed,) = [line for line in capsys.readouterr().out.splitlines() if "roundel calibrate" in line]
+    words = shlex.split(printed[printed.index("roundel calibrate") :])
     (tmp_path / "wand.yaml").write_text("{diameter_m: 0.12, markers: [[0, 0, 0], [0.2, 0, 0], [0.5, 0, 0]]}")
-    execute(words[3:])
+    execute(words[2:])
     assert_near(load_rig(out), arena.truth, 2e-4, 2e-4)  # no noise
 
 

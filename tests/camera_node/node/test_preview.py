@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.commands.adjust import CameraConnection, ChangeSettings, SaveSnapshot
+from camera_node.commands.adjust import ChangeSettings, SaveSnapshot
 from camera_node.commands.publish import open_source
 from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import GREEN, draw_preview
@@ -29,6 +29,7 @@ from camera_node.protocol.messages import (
     encode,
     jpeg_size,
 )
+from camera_node.protocol.server_connection import Connection
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.node.picture import CENTRE, render
 from tests.waiting import wait_for
@@ -137,31 +138,31 @@ def test_a_noisy_image_still_fits():
 
 def test_masking_what_is_detected_silences_it(network, node: Node, tmp_path: Path, capsys):
     """By the command; then the node detects nothing there, and the mask can be removed."""
-    client, server = network.client(), CameraConnection(connect=(network.endpoint,))
+    client, server = network.client(), Connection(connect=(network.endpoint,))
     wait_for(lambda: _detects(client), deadline_s=20)
-    ChangeSettings(name="cam0", mask_detected=True, min_contrast=30.0, server=server).run()
+    ChangeSettings(name="cam0", mask_detected=True, min_contrast=30.0, connection=server).run()
     printed = capsys.readouterr().out
     assert "mask: 1 polygons" in printed
     assert "min_contrast: 30" in printed
     wait_for(lambda: not _detects(client), deadline_s=20)
-    ChangeSettings(name="cam0", clear_mask=True, server=server).run()
+    ChangeSettings(name="cam0", clear_mask=True, connection=server).run()
     wait_for(lambda: _detects(client), deadline_s=20)
     assert request_settings(client, "arena", "cam0").mask == ()
 
 
 def test_a_drawn_mask_silences_what_is_in_it(network, node: Node, capsys):
     """Two corners are a rectangle; a mask beside the roundel changes nothing; both are refused without an area."""
-    client, server = network.client(), CameraConnection(connect=(network.endpoint,))
+    client, server = network.client(), Connection(connect=(network.endpoint,))
     wait_for(lambda: _detects(client), deadline_s=20)
     u, v = next_detections(client, "arena", "cam0").unpack().uv[0]
-    ChangeSettings(name="cam0", mask=(f"{u + 60},{v + 60}", f"{u + 80},{v + 70}"), server=server).run()
+    ChangeSettings(name="cam0", mask=(f"{u + 60},{v + 60}", f"{u + 80},{v + 70}"), connection=server).run()
     wait_for(lambda: _detects(client), deadline_s=20)
-    ChangeSettings(name="cam0", mask=(f"{u - 9},{v - 9}", f"{u + 9},{v + 9}"), server=server).run()
+    ChangeSettings(name="cam0", mask=(f"{u - 9},{v - 9}", f"{u + 9},{v + 9}"), connection=server).run()
     assert "mask: 2 polygons" in capsys.readouterr().out
     wait_for(lambda: not _detects(client), deadline_s=20)
     for corners in (("1,1",), ("1,1", "1,9"), ("nan,1", "5,9"), ("1,1", "5")):
         with pytest.raises(ConfigError):
-            ChangeSettings(name="cam0", mask=corners, server=server).run()
+            ChangeSettings(name="cam0", mask=corners, connection=server).run()
 
 
 def _detects(client) -> bool:
@@ -178,12 +179,12 @@ def test_a_mask_covers_the_detection_and_little_more(network, node: Node):
 
 
 def test_a_snapshot_is_saved(network, node: Node, tmp_path: Path):
-    server, out = CameraConnection(connect=(network.endpoint,)), tmp_path / "seen.jpg"
+    server, out = Connection(connect=(network.endpoint,)), tmp_path / "seen.jpg"
     wait_for(lambda: node._statistics.latest)
-    SaveSnapshot(name="cam0", out=out, draw=True, server=server).run()
+    SaveSnapshot(name="cam0", out=out, draw=True, connection=server).run()
     assert jpeg_size(out.read_bytes()) == (320, 240)
     with pytest.raises(ConfigError, match="does its folder exist"):
-        SaveSnapshot(name="cam0", out=tmp_path / "no" / "x.jpg", server=server).run()
+        SaveSnapshot(name="cam0", out=tmp_path / "no" / "x.jpg", connection=server).run()
 
 
 def test_an_absent_camera_is_named(network):

@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 
 from camera_node.foundation.errors import ConfigError
+from camera_node.protocol.server_connection import Connection
 from fusion.commands.define import define
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots
@@ -23,7 +24,9 @@ def command(endpoint: str, *words: str) -> list[str]:
 def test_a_robot_is_replaced_on_request_only(tmp_path):
     """Its name is refused before the measurement, and the declaration stays."""
     with serving_an_unknown_robot(tmp_path) as (endpoint, client):
-        measure = partial(define, "a", diameter=0.12, connect=(endpoint,), arena="test")
+        measure = partial(
+            define, "a", diameter=0.12, connection=Connection(connect=(endpoint,), arena="test")
+        )
         before = client.declared_robots().robots["a"]
         with pytest.raises(ConfigError, match="add --replace"):
             measure()

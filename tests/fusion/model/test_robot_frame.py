@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera_node.foundation.errors import ConfigError
+from camera_node.protocol.server_connection import Connection
 from fusion.commands.robots import robots
 from fusion.errors import FusionError
 from fusion.model.robots import DECIMALS, MAX_PIVOT_M, load_robots, move_origin, turn_heading
@@ -78,30 +79,31 @@ def test_impossible_changes_are_refused(bad: float):
 def test_the_commands_change_the_running_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Pivot and turn; an unknown robot is refused with the known names, and so is a word for a number."""
     with serving(config(tmp_path)) as (server, client):
-        connect = tuple(server.endpoints)
-        robots("pivot", ("a", "0.1", "0", "0"), connect=connect, arena="test")
-        robots("turn", ("a", "90"), connect=connect, arena="test")
+        connection = Connection(connect=tuple(server.endpoints), arena="test")
+        robots("pivot", ("a", "0.1", "0", "0"), connection=connection)
+        robots("turn", ("a", "90"), connection=connection)
         assert client.declared_robots().robots["a"] == turn_heading(
             move_origin(TRIANGLE, (0.1, 0.0, 0.0)), 90.0
         )
         with pytest.raises(FusionError, match="no robot 'b'; there are a"):
-            robots("turn", ("b", "90"), connect=connect, arena="test")
+            robots("turn", ("b", "90"), connection=connection)
         with pytest.raises(ConfigError, match="give numbers"):
-            robots("turn", ("a", "left"), connect=connect, arena="test")
+            robots("turn", ("a", "left"), connection=connection)
 
 
 def test_the_commands_list_save_rename_and_remove_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with serving(config(tmp_path)) as (server, client):
-        connect, out = tuple(server.endpoints), tmp_path / "saved.yaml"
-        robots("list", connect=connect, arena="test")
+        connection = Connection(connect=tuple(server.endpoints), arena="test")
+        out = tmp_path / "saved.yaml"
+        robots("list", connection=connection)
         assert capsys.readouterr().out == "a: 3 markers of 0.12 m\n"
-        robots("save", (str(out),), connect=connect, arena="test")
+        robots("save", (str(out),), connection=connection)
         assert load_robots(out) == {"a": TRIANGLE}
         with pytest.raises(ConfigError, match="exists; add --force"):
-            robots("save", (str(out),), connect=connect, arena="test")
-        robots("rename", ("a", "cart"), connect=connect, arena="test")
+            robots("save", (str(out),), connection=connection)
+        robots("rename", ("a", "cart"), connection=connection)
         assert client.declared_robots().robots == {"cart": TRIANGLE}
-        robots("remove", ("cart",), connect=connect, arena="test")
+        robots("remove", ("cart",), connection=connection)
         assert client.declared_robots().robots == {}
-        with pytest.raises(ConfigError, match="use fusion robots rename OLD NEW"):
-            robots("rename", ("a",), connect=connect, arena="test")
+        with pytest.raises(ConfigError, match="use roundel robots rename OLD NEW"):
+            robots("rename", ("a",), connection=connection)

@@ -14,7 +14,7 @@ from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import encode
-from camera_node.protocol.server_connection import ServerConnection
+from camera_node.protocol.server_connection import Connection, ServerConnection
 from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.model.limits import Limits
@@ -101,7 +101,8 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
             client.status(60.0).next()
 
         with repeating(publish):
-            record(tmp_path / "live.mcap", connect=server.endpoints, arena="test", seconds=4.0)
+            connection = Connection(connect=server.endpoints, arena="test")
+            record(tmp_path / "live.mcap", connection=connection, seconds=4.0)
     recording = read_recording(tmp_path / "live.mcap")
     assert {message.camera for _, message in recording.detections} == ARENA.cameras.keys()
     assert recording.rig is not None

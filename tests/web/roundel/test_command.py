@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command `roundel`: its commands, their help, and mistakes in the command line."""
 
+import contextlib
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from camera_node.foundation.command_line import Command
 from camera_node.foundation.errors import ConfigError
 from web.roundel.command import COMMANDS, execute
 
+WORK = ("up", "camera", "print", "calibrate", "define", "record", "ros2")  # in its order
 MAIN = "from web.roundel.command import main; main()"
 
 
@@ -28,6 +32,13 @@ def roundel(*words: str, folder: Path | None = None, **env: str) -> subprocess.C
     )
 
 
+def with_groups(commands: Sequence[Command], before: str = "") -> list[tuple[str, Command]]:
+    """The words and the record of each command, also of those in groups."""
+    named = [(f"{before}{command.name}", command) for command in commands]
+    groups = [with_groups(c.target, f"{words} ") for words, c in named if not isinstance(c.target, str)]
+    return named + [entry for group in groups for entry in group]
+
+
 def mistake(*words: str) -> str:
     """The error of a command line, in this process."""
     with pytest.raises(ConfigError) as error:
@@ -40,18 +51,20 @@ def mistake(*words: str) -> str:
 def test_the_list_of_commands_is_complete(tmp_path: Path):
     """Without a command, all of them in the order of the work, each with a summary."""
     text = roundel(folder=tmp_path).stdout
-    assert re.findall(r"^  (\w+) +\w", text, re.MULTILINE) == list(COMMANDS)
+    listed = re.findall(r"^  (\w+) +\w", text, re.MULTILINE)
+    assert sorted(listed) == sorted(command.name for command in COMMANDS)
+    assert [name for name in listed if name in WORK] == list(WORK)
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_has_examples(name: str, capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize(("words", "command"), with_groups(COMMANDS))
+def test_help_has_examples(words: str, command: Command, capsys: pytest.CaptureFixture[str]):
     """Each command's help shows its examples, complete and on a line of their own."""
-    with pytest.raises(SystemExit) as end:
-        execute(name, "--help")
-    assert not end.value.code
+    with contextlib.suppress(SystemExit):
+        assert execute(*words.split(), "--help") == 0
     text = capsys.readouterr().out
-    assert f"usage: roundel {name}" in text
-    for example in COMMANDS[name].examples:
+    assert f"usage: roundel {words}" in text
+    assert command.examples
+    for example in command.examples:
         assert f"\n  {example}\n" in text
 
 

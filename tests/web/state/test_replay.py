@@ -17,8 +17,8 @@ from fusion.protocol.pose_messages import Robots, robots_key
 from tests.waiting import wait_for
 from tests.web.arena import ArenaMessages, four_cameras
 from tests.web.browser import loopback
-from web.__main__ import Options, show_recording
 from web.errors import WebError
+from web.roundel.view import ViewArena
 from web.state.feed import Feed
 from web.state.replay import RecordingPlayer
 from web.tables import tabulate_robots
@@ -139,7 +139,7 @@ def test_without_a_page_it_ends_with_the_recording(tmp_path: Path, capsys: pytes
     """It prints one line per second; the last one shows the end of the recording."""
     with RecordingWriter(tmp_path / "short.mcap") as writer:
         RecordedArena(writer).pose("rover", (0.5, 0.0, 0.0))
-    show_recording(tmp_path / "short.mcap", Options(headless=True), threading.Event())
+    ViewArena(headless=True).show_recording(tmp_path / "short.mcap", threading.Event())
     assert "rover tracked at +0.50 +0.00 +0.00" in capsys.readouterr().out.splitlines()[-1]
 
 

@@ -17,6 +17,7 @@ from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from camera_node.foundation.errors import NetworkError
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.requests import RequestError
+from camera_node.protocol.server_connection import Connection
 from camera_node.protocol.session import open_router
 from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
@@ -182,7 +183,7 @@ def test_the_history_names_each_version(tmp_path: Path, capsys: pytest.CaptureFi
         versions = client.rig_history().versions
         assert [version.source and version.source.program for version in versions] == ["fusion.client"] * 3
         assert 0 < versions[1].t_ns - before_ns < 60 * 10**9
-        history(connect=tuple(server.endpoints), arena="test")
+        history(connection=Connection(connect=tuple(server.endpoints), arena="test"))
     lines = capsys.readouterr().out.splitlines()
     assert ["clock offset of cam0, by fusion.client of" in line for line in lines] == [False, True, True]
 
