@@ -5,13 +5,18 @@ BIN := .venv/bin
 NATIVE := $(shell find camera_node/native fusion/native -name '*.[ch]pp')
 CORES := $(shell find camera_node/native fusion/native -name '*.cpp' ! -name 'bind*')
 
-.PHONY: demo test check docs setup format clean
+PIP = $(1)/bin/python -m pip install --quiet --disable-pip-version-check
+TEST = OPENBLAS_NUM_THREADS=1 $(1)/bin/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder $(ARGS)
+# What builds the native modules, and what `pip install` would otherwise fetch for it.
+BUILD_REQUIRES := $(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], "cmake", "ninja", sep="\n")'
+
+.PHONY: demo test check docs setup constraints newest format clean
 
 demo: .venv/ready
 	@$(BIN)/python -m web --demo $(ARGS)
 
 test: .venv/ready
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder $(ARGS)
+	$(call TEST,.venv)
 
 check: .venv/ready
 	$(BIN)/ruff format --check .
@@ -35,15 +40,34 @@ format: .venv/ready
 setup: .venv/ready
 
 # Without build isolation, so that this build and the wheel's test compile changed files only.
-.venv/ready: pyproject.toml CMakeLists.txt $(NATIVE)
+.venv/ready: constraints.txt pyproject.toml CMakeLists.txt $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "error: $(PYTHON) is older than Python 3.11; run make with PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@$(PYTHON) -m venv .venv
 	@echo "setting up .venv (a few minutes the first time)"
-	@$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' \
-	  | $(BIN)/python -m pip install --quiet --disable-pip-version-check -r /dev/stdin
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[server,dev]'
+	@$(BUILD_REQUIRES) | $(call PIP,.venv) -c constraints.txt -r /dev/stdin
+	@PATH="$(CURDIR)/.venv/bin:$$PATH" $(call PIP,.venv) -c constraints.txt --no-build-isolation -e '.[server,dev]'
 	@touch $@
+
+# The newest versions that pyproject.toml allows, for each Python from 3.11 on: CONTRIBUTING.md.
+constraints:
+	@$(PYTHON) -m venv --clear build/resolver
+	@$(call PIP,build/resolver) uv
+	@$(BUILD_REQUIRES) > build/resolver/build.in
+	@{ echo "# Versions of every package that the demo, the tests and CI install. Made by \`make constraints\`."; \
+	  build/resolver/bin/uv pip compile --quiet --upgrade --universal --python-version 3.11 --no-header --no-annotate \
+	    --extra server --extra dev --extra benchmarks pyproject.toml build/resolver/build.in; } > build/resolver/constraints.txt
+	@mv build/resolver/constraints.txt constraints.txt
+	@git --no-pager diff --stat constraints.txt
+
+# The suite with the newest versions that pyproject.toml allows, whatever constraints.txt says; writes only below build/.
+newest:
+	@$(PYTHON) -m venv --clear build/newest
+	@$(BUILD_REQUIRES) | $(call PIP,build/newest) --upgrade -r /dev/stdin
+	@PATH="$(CURDIR)/build/newest/bin:$$PATH" $(call PIP,build/newest) --upgrade --no-build-isolation \
+	  -C build-dir=build/newest/native -e '.[server,dev]'
+	@build/newest/bin/python -m pip freeze --exclude-editable > build/newest/versions.txt
+	$(call TEST,build/newest)
 
 clean:
 	rm -rf .venv build
