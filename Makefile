@@ -6,7 +6,7 @@ NATIVE := $(shell find camera_node/native fusion/native -name '*.[ch]pp')
 CORES := $(shell find camera_node/native fusion/native -name '*.cpp' ! -name 'bind*')
 
 PIP = $(1)/bin/python -m pip install --quiet --disable-pip-version-check
-TEST = OPENBLAS_NUM_THREADS=1 $(1)/bin/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder $(ARGS)
+TEST = OPENBLAS_NUM_THREADS=1 $(1)/bin/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder --second-run $(ARGS)
 # What builds the native modules, and what `pip install` would otherwise fetch for it.
 BUILD_REQUIRES := $(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], "cmake", "ninja", sep="\n")'
 

@@ -16,6 +16,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from tests.second_run import SecondRun
+
 ROOT = Path(__file__).resolve().parents[1]
 WAND_S = 8.0  # in this time each camera of the demo sees the wand in most of its image
 
@@ -70,6 +72,18 @@ def is_of_page(item: pytest.Item) -> bool:
     return is_live(item) and item.path.parent == ROOT / "tests" / "web"
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--second-run", action="store_true", help="run a live test that failed once more, by itself"
+    )
+    parser.addoption("--live-only", action="store_true", help="deselect the tests that only compute")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("second_run") and "PYTEST_XDIST_WORKER" not in os.environ:
+        config.pluginmanager.register(SecondRun(config))
+
+
 def pytest_xdist_auto_num_workers() -> int:
     """One process for live tests, which wait for half of their time, and one for each processor."""
     has_affinity = hasattr(os, "sched_getaffinity")  # on Linux
@@ -77,12 +91,15 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Run live tests first, one at a time but for those of the page, beside which another one runs.
 
     Other tests of one file run in one process, which shares fixtures. A slow test gets more time before it counts as
     hanging.
     """
+    if config.getoption("live_only"):
+        config.hook.pytest_deselected(items=[item for item in items if not is_live(item)])
+        items[:] = filter(is_live, items)
     items.sort(key=lambda item: (not is_live(item), is_of_page(item)))
     for item in items:
         group = "page" if is_of_page(item) else "live" if is_live(item) else str(item.path)
