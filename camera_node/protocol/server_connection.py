@@ -33,7 +33,7 @@ class ServerConnection:
     """A Zenoh session that opens as soon as the server answers, and reconnects after every loss.
 
     A Zenoh client does not open while no router answers. Sessions in mode router open at once, but they sometimes stay
-    without routes after an outage or beside another one that opens or closes (measured with 1.10, DECISIONS 106).
+    without routes after an outage or beside another one that opens or closes (measured with 1.10, DECISIONS 35).
 
     Args:
         connect: endpoints of the server.

@@ -7,7 +7,7 @@ noise of the image alone, without the part of the covariance for lens errors tha
 
 Lenses: "exact" ones are declared so by their files (`lens_sigma` 0), "calibrated" ones are off by what their files
 state, "rough" ones by 0.4 %, and of "unstated" ones, which are exact too, no file says so: there the covariance claims
-errors that do not exist (DECISIONS 121), so poses are below 1 and noise is not.
+errors that do not exist (DECISIONS 18), so poses are below 1 and noise is not.
 
 A figure outside of 0.6 to 1.6 is marked with "!", and with "?" if its standard error over seeds may explain it.
 Options: `--seeds N` (3), `--jobs N` processes (all processors), `--save FILE`: results are added to the file, and

@@ -23,7 +23,7 @@ def test_faults_are_reported_and_disturb_nothing_else(tmp_path: Path):
     assert not result.failures()
 
 
-@pytest.mark.slow  # half a minute; poses were metres off in one of three runs before DECISIONS 177
+@pytest.mark.slow  # half a minute; poses were metres off in one of three runs before DECISIONS 31
 def test_mutated_messages_change_no_pose(tmp_path: Path):
     """No crash and few log lines."""
     *_, result = fuzz(tmp_path, Fuzz(MESSAGES, rate=500.0), ("viewer", "recorder", "listener"), 3.0)
