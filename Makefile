@@ -10,7 +10,7 @@ TEST = OPENBLAS_NUM_THREADS=1 $(1)/bin/python -m pytest -n auto --dist loadgroup
 # What builds the native modules, and what `pip install` would otherwise fetch for it.
 BUILD_REQUIRES := $(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], "cmake", "ninja", sep="\n")'
 
-.PHONY: demo test check docs setup constraints newest format clean
+.PHONY: demo test check lint types docs setup constraints newest format clean
 
 demo: .venv/ready
 	@$(BIN)/python -m web --demo $(ARGS)
@@ -18,7 +18,9 @@ demo: .venv/ready
 test: .venv/ready
 	$(call TEST,.venv)
 
-check: .venv/ready
+check: lint types
+
+lint: .venv/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/clang-format --dry-run --Werror $(NATIVE)
@@ -26,7 +28,17 @@ check: .venv/ready
 	@! command -v clang++ >/dev/null || printf '%s\n' $(CORES) | xargs -P 4 -I FILE clang++ -fsyntax-only -std=c++20 \
 	  -Werror -Wall -Wextra -Wpedantic -Wshadow -Wcomma -Icamera_node/native -Ifusion/native FILE
 	$(BIN)/lint-imports
+	@! command -v go >/dev/null || $(MAKE) --no-print-directory build/bin/actionlint
+	@[ ! -x build/bin/actionlint ] || build/bin/actionlint
+	@[ -x build/bin/actionlint ] || echo "Go is not installed: the workflows are not checked"
+
+types: .venv/ready
 	$(BIN)/basedpyright
+
+# The workflows' checker: its wheel would download a program that no registry has. Without access to Go's modules it is missed.
+build/bin/actionlint:
+	@mkdir -p $(@D)
+	@GOBIN=$(CURDIR)/$(@D) go install github.com/rhysd/actionlint/cmd/actionlint@v1.7.12 2>/dev/null || true
 
 docs: .venv/ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -122,3 +122,23 @@ def test_each_extra_works_without_the_packages_of_the_others(extra: str):
             process.kill()
     assert said
     assert "pip install" not in said
+
+
+def test_constraints_fix_one_version_of_each_requirement_and_name_no_address():
+    """But of picamera2, which the camera's system has; `make constraints` writes the file."""
+    content = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = content["project"]
+    lists = (
+        content["build-system"]["requires"],
+        project["dependencies"],
+        *project["optional-dependencies"].values(),
+    )
+    requirements = {re.split(r"[\[><=;]", word)[0] for words in lists for word in words} - {
+        "roundel",
+        "picamera2",
+    }
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    pinned = [re.fullmatch(r"([a-z0-9-]+)==[\w.]+(?: ; [\w.'<>= ]+)?", line) for line in lines]
+    assert all(pinned), [line for line, match in zip(lines, pinned, strict=True) if not match]
+    names = {match[1] for match in pinned if match}
+    assert requirements <= names, requirements - names
