@@ -30,6 +30,10 @@ class BlockTridiagonal:
         diagonal[1:] += parts[:, h:, h:]
         return cls(diagonal, parts[:, h:, :h])
 
+    def add_diagonal(self, added: Array) -> "BlockTridiagonal":
+        """The matrix with `added` (K, h) on its diagonal."""
+        return BlockTridiagonal(self.diagonal + added[:, :, None] * np.eye(added.shape[1]), self.below)
+
     def multiply(self, columns: Array) -> Array:
         """The product with columns (K, h, n), of the same shape."""
         product = self.diagonal @ columns

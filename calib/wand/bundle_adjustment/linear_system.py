@@ -55,21 +55,6 @@ class LinearSystem:
     priors: list[CameraPrior]
     background: PointInformation
 
-    def diagonal(self) -> tuple[Array, Array]:
-        """The Hessian's diagonal: (K, 6 B) of the knots and (C, d) of the cameras, without priors of the cameras."""
-        half, cameras = 6 * len(self.problem.wand.basis), len(self.problem.lenses)
-        squares = np.add.reduceat(self.rows**2, self.bounds[:-1])
-        interval, camera = np.divmod(self.views, cameras)
-        of_knots = np.zeros((len(self.problem.knot_s), half))
-        of_cameras = np.zeros((cameras, len(self.problem.free)))
-        np.add.at(of_knots, interval, squares[:, :half])
-        np.add.at(of_knots, interval + 1, squares[:, half : 2 * half])
-        np.add.at(of_cameras, camera, squares[:, 2 * half : -1])
-        of_motion = np.einsum("lii->li", self.chain)
-        of_knots[:-1] += of_motion[:, :half]
-        of_knots[1:] += of_motion[:, half:-1]
-        return of_knots, of_cameras
-
 
 def linearize(
     problem: Problem, observations: WandObservations, state: State, weights: Weights

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.wand.bundle_adjustment.eliminated_points import accept, locate, locate_robustly, point_error_norms
-from calib.wand.bundle_adjustment.gtsam_step import solve_step
 from calib.wand.bundle_adjustment.linear_system import LinearSystem, linearize
 from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import (
@@ -22,7 +21,7 @@ from calib.wand.bundle_adjustment.residuals import (
     find_weights,
     reprojection_errors,
 )
-from calib.wand.bundle_adjustment.schur_complement import profile_motion
+from calib.wand.bundle_adjustment.schur_complement import profile_motion, solve_step
 from camera_node.foundation.arrays import Array, Mask
 
 CAUCHY_SCALE = 2.3849  # sigmas: 95 % efficient on normal residuals
@@ -284,7 +283,7 @@ def _descend(objective: _Objective, before: _Step) -> _Step | None:
             norms = objective.norms(state)
             if (cost := objective.cost(norms)) <= before.cost:
                 return _Step(state, norms, cost, damping)
-        except (RuntimeError, ValueError):  # GTSAM: a nearly singular system; Lens: impossible parameters
+        except (RuntimeError, ValueError):  # a nearly singular system; Lens: impossible parameters
             pass
         damping *= 10
     return None

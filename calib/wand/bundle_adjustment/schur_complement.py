@@ -1,19 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Eliminates the wand's motion from a linear system (Schur complement), which leaves the cameras' step and information.
+"""Solves a linear system: NumPy eliminates the wand's motion (Schur complement), GTSAM the cameras.
 
 The motion is a chain, so its Hessian is block tridiagonal, and one factorization eliminates it for all cameras at once.
+What remains is a graph of the cameras: their information, and their priors.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, cast
 
 import numpy as np
 
-from calib.rig.camera import PER_CAMERA
+from calib.rig.camera import PER_CAMERA, READOUT
 from calib.wand.block_tridiagonal import BlockTridiagonal
 from calib.wand.bundle_adjustment.linear_system import LinearSystem
 from calib.wand.bundle_adjustment.problem import Problem, State, gauge_directions
+from calib.wand.bundle_adjustment.residuals import CameraPrior
 from camera_node.foundation.arrays import Array, Index
+
+# Information that fixes the gauge at the first camera and its clock: about the information of the observations. Readout
+# times and lenses are no part of the gauge.
+ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * (PER_CAMERA - READOUT[0]))
+# Damping of a knot's position and velocity, of the information in the best observed direction of each: a knot that only
+# one camera observed is not determined along its viewing ray.
+MIN_RELATIVE_INFORMATION = 2.0**-22
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +53,67 @@ class ProfiledMotion:
         """The Gauss-Newton step, (C, 18) of the cameras and (K, h) of the motion, and how far it is: the square of its
         Mahalanobis length in the cameras."""
         of_cameras = invert_information(problem, state, self.information) @ self.gradient
-        camera_step = np.zeros((len(problem.lenses), PER_CAMERA))
-        estimated = list(problem.estimated_cameras())
-        camera_step[np.ix_(estimated, problem.free)] = of_cameras.reshape(len(estimated), -1)
         motion_step = self.motion_step - self.response @ of_cameras
-        return camera_step, motion_step, float(of_cameras @ self.gradient)
+        return _all_parameters(problem, of_cameras), motion_step, float(of_cameras @ self.gradient)
+
+
+def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
+    """Solve for the step of Levenberg-Marquardt: (C, 18) of the cameras and (K, h) of the motion.
+
+    The Hessian's diagonal is multiplied by 1 + `damping` (Marquardt). Where all cameras are estimated, the first camera
+    and its clock are fixed (gauge).
+
+    Raises:
+        RuntimeError, LinAlgError: the system is nearly singular; more damping helps.
+    """
+    sums = _Sums.of(system)
+    (knots, h), size = sums.gradient.shape, len(sums.of_cameras)
+    diagonal = np.einsum("kii->ki", sums.motion.diagonal)
+    best = diagonal.reshape(knots, 2, -1).max(axis=2)
+    least = MIN_RELATIVE_INFORMATION * np.repeat(best, h // 2, axis=1)
+    motion = sums.motion.add_diagonal(damping * diagonal + least).factorize()
+    right = np.concatenate([sums.crossed, sums.gradient[:, :, None]], axis=2)
+    response, motion_step = np.split(motion.solve(right), [size], axis=2)
+    crossed = sums.crossed.reshape(-1, size)
+    information = sums.of_cameras - crossed.T @ response.reshape(-1, size)
+    information += damping * np.diag(np.diag(sums.of_cameras))
+    gradient = sums.scores.sum(axis=0) - crossed.T @ motion_step.ravel()
+    of_cameras = _solve_cameras(system, information, gradient)
+    return _all_parameters(system.problem, of_cameras), motion_step[:, :, 0] - response @ of_cameras
+
+
+def _solve_cameras(system: LinearSystem, information: Array, gradient: Array) -> Array:
+    """(S d,) the step of the estimated cameras, from their information and gradient, to which their priors are added.
+
+    Raises:
+        RuntimeError: the system is nearly singular.
+    """
+    import gtsam
+
+    free, estimated = list(system.problem.free), list(system.problem.estimated_cameras())
+    d, graph, ordering = len(free), gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    H, g = information.reshape(len(estimated), d, len(estimated), d), gradient.reshape(-1, d)
+    zero, none = np.zeros((d, d)), np.zeros(d)
+    for k in range(len(estimated)):
+        ordering.push_back(k)
+        graph.push_back(gtsam.HessianFactor(k, H[k, :, k], g[k], 0.0))
+    for a, b in combinations(range(len(estimated)), 2):  # only the sum of all is positive definite
+        graph.push_back(gtsam.HessianFactor(a, b, zero, H[a, :, b], none, zero, none, 0.0))
+    for cameras, prior in _estimated_priors(system):
+        blocks = [part for block in zip(cameras, prior.jacobians, strict=True) for part in block]
+        unit = gtsam.noiseModel.Unit.Create(len(prior.error))
+        graph.push_back(cast(Any, gtsam.JacobianFactor)(*blocks, prior.error, unit))
+    if system.problem.estimated is None:
+        graph.push_back(gtsam.HessianFactor(0, np.diag(ANCHOR[free]), none, 0.0))
+    step = graph.optimize(ordering)
+    return np.concatenate([step.at(k) for k in range(len(estimated))])
+
+
+def _all_parameters(problem: Problem, of_cameras: Array) -> Array:
+    """(C, 18) steps of all parameters of all cameras, from those (S d,) of the estimated ones; 0 for the others."""
+    estimated, step = problem.estimated_cameras(), np.zeros((len(problem.lenses), PER_CAMERA))
+    step[np.ix_(estimated, problem.free)] = of_cameras.reshape(len(estimated), -1)
+    return step
 
 
 def invert_information(problem: Problem, state: State, information: Array) -> Array:
@@ -70,17 +137,17 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     """
     sums, prior = _Sums.of(system), system.motion_prior[:, :-1, :-1]
     h, size = sums.gradient.shape[1], len(sums.of_cameras)
-    motion = BlockTridiagonal.of_chain(sums.hessian).factorize()
+    motion = sums.motion.factorize()
     G = motion.solve(sums.crossed)
     along = (sums.crossed + BlockTridiagonal.of_chain(prior).multiply(G)).reshape(-1, size)
     observed = sums.observed
-    scores = sums.scores - (observed[:, None, :h] @ G[:-1] + observed[:, None, h:] @ G[1:])[:, 0]
-    estimated = list(system.problem.estimated_cameras())
-    scores = np.concatenate([scores, system.background.scores[:, estimated].reshape(-1, size)])
+    scores = sums.scores.copy()
+    scores[: len(observed)] -= (observed[:, None, :h] @ G[:-1] + observed[:, None, h:] @ G[1:])[:, 0]
+    by_priors, gradient = _prior_equations(system)
     return ProfiledMotion(
-        information=sums.of_cameras - G.reshape(-1, size).T @ along,
+        information=sums.of_cameras + by_priors - G.reshape(-1, size).T @ along,
         scores=scores,
-        gradient=scores.sum(axis=0) + _prior_gradient(system),
+        gradient=scores.sum(axis=0) + gradient,
         response=G,
         motion_step=motion.solve(sums.gradient[:, :, None])[:, :, 0],
     )
@@ -91,15 +158,15 @@ class _Sums:
     """The normal equations of all residuals.
 
     Attributes:
-        hessian: (L, 2 h, 2 h) of the motion, by interval.
+        motion: Hessian of the motion.
         gradient: (K, h) of the motion, by knot.
         observed: (L, 2 h) of the motion, by interval, without the motion prior.
         crossed: (K, h, S d) products of the derivatives by the motion and by the cameras.
-        scores: (L, S d) gradients of the cameras, without priors.
-        of_cameras: (S d, S d) Hessian of the cameras, with background points and priors.
+        scores: (L + J, S d) gradients of the cameras, by interval, then by background point, without priors.
+        of_cameras: (S d, S d) Hessian of the cameras, with background points, without priors.
     """
 
-    hessian: Array
+    motion: BlockTridiagonal
     gradient: Array
     observed: Array
     crossed: Array
@@ -109,18 +176,20 @@ class _Sums:
     @classmethod
     def of(cls, system: LinearSystem) -> "_Sums":
         local, d = 12 * len(system.problem.wand.basis), len(system.problem.free)
-        h, (knots, size) = local // 2, (len(system.chain) + 1, len(system.problem.estimated_cameras()) * d)
+        estimated, knots, h = list(system.problem.estimated_cameras()), len(system.chain) + 1, local // 2
+        size = len(estimated) * d
         motion = _sum_motion(system, local)
         gradient = np.zeros((knots, h))
         gradient[:-1] += motion[:, :h, -1]
         gradient[1:] += motion[:, h:, -1]
         crossed, scores = _sum_cameras(system, local)
+        beside = system.background.scores[:, estimated].reshape(-1, size)
         return cls(
-            hessian=motion[:, :, :-1],
+            motion=BlockTridiagonal.of_chain(motion[:, :, :-1]),
             gradient=gradient,
             observed=motion[:, :, -1] - system.motion_prior[:, :-1, -1],
             crossed=crossed.reshape(knots, h, size),
-            scores=scores.reshape(knots - 1, size),
+            scores=np.concatenate([scores.reshape(knots - 1, size), beside]),
             of_cameras=_sum_camera_hessians(system, local).reshape(size, size),
         )
 
@@ -156,38 +225,34 @@ def _sum_cameras(system: LinearSystem, local: int) -> tuple[Array, Array]:
 
 
 def _sum_camera_hessians(system: LinearSystem, local: int) -> Array:
-    """(S, d, S, d) Hessian of the cameras, with background points and priors."""
+    """(S, d, S, d) Hessian of the cameras, with background points, without priors."""
     estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
     of_row = np.repeat(system.views % len(system.problem.lenses), np.diff(system.bounds))
-    own = prior_information(system)
-    own += system.background.information[np.ix_(estimated, range(d), estimated, range(d))]
+    own = system.background.information[np.ix_(estimated, range(d), estimated, range(d))]
     for k, camera in enumerate(estimated):
         J = system.rows[of_row == camera, local:-1]
         own[k, :, k] += J.T @ J
     return own
 
 
-def _prior_gradient(system: LinearSystem) -> Array:
-    """(S d,) gradient of the priors of the estimated cameras."""
-    estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
-    g = np.zeros((len(estimated), d))
+def _estimated_priors(system: LinearSystem) -> Iterator[tuple[list[int], CameraPrior]]:
+    """The priors of estimated cameras, and the places of their cameras among the estimated ones."""
+    place = {camera: k for k, camera in enumerate(system.problem.estimated_cameras())}
     for prior in system.priors:
-        if set(prior.cameras) <= set(estimated):
-            for camera, J in zip(prior.cameras, prior.jacobians, strict=True):
-                g[estimated.index(camera)] += J.T @ prior.error
-    return g.ravel()
+        if place.keys() >= set(prior.cameras):
+            yield [place[camera] for camera in prior.cameras], prior
 
 
-def prior_information(system: LinearSystem) -> Array:
-    """(S, d, S, d) information of the priors of the estimated cameras."""
-    estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
-    H = np.zeros((len(estimated), d, len(estimated), d))
-    for prior in system.priors:
-        if set(prior.cameras) <= set(estimated):
-            for a, J_a in zip(prior.cameras, prior.jacobians, strict=True):
-                for b, J_b in zip(prior.cameras, prior.jacobians, strict=True):
-                    H[estimated.index(a), :, estimated.index(b)] += J_a.T @ J_b
-    return H
+def _prior_equations(system: LinearSystem) -> tuple[Array, Array]:
+    """(S d, S d) information and (S d,) gradient of the priors of the estimated cameras."""
+    S, d = len(system.problem.estimated_cameras()), len(system.problem.free)
+    H, g = np.zeros((S, d, S, d)), np.zeros((S, d))
+    for cameras, prior in _estimated_priors(system):
+        for a, J_a in zip(cameras, prior.jacobians, strict=True):
+            g[a] += J_a.T @ prior.error
+            for b, J_b in zip(cameras, prior.jacobians, strict=True):
+                H[a, :, b] += J_a.T @ J_b
+    return H.reshape(S * d, S * d), g.ravel()
 
 
 def _equal_blocks(rows: Array, bounds: Index) -> Iterator[tuple[Index, Array]]:
