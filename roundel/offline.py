@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from calib.wand.quality.assessment import assess
+from calib.wand.report import WandReport
 
 from calib.errors import CalibrationError
 from calib.intrinsics.board import make_finder
@@ -21,9 +23,7 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.assessment import assess
 from calib.wand.quality.grade import RigQuality
-from calib.wand.report import WandReport
 from calib.wand.scale import SIGMA_M, Distance
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import ConfigError

@@ -16,9 +16,9 @@ from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
-from calib.wand.quality.assessment import assess
-from calib.wand.result import WandCalibration
+from calib.wand.quality.grade import assess
 from calib.wand.scale import Distance
+from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.terminal import progress_console, say
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

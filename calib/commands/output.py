@@ -17,7 +17,7 @@ from calib.live.rig_requests import set_rig
 from calib.rig.precision_plot import draw_precision
 from calib.rig.rig import Rig, save_rig
 from calib.wand.quality.grade import RigQuality
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestError

@@ -11,8 +11,7 @@ from calib.live.session_progress import SessionProgress
 from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
 from calib.wand.recalibration import Recalibration
-from calib.wand.report import WandReport
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration, WandReport
 from camera_node.foundation.terminal import console, say
 
 MIN_INFLATION = 1.2  # of standard deviations, that is printed

@@ -23,9 +23,9 @@ from calib.live.wand_session import run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand
-from calib.wand.bundle_adjustment.lens_prior import widen_lenses
+from calib.wand.bundle_adjustment.covariance import widen_lenses
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.assessment import assess
+from calib.wand.quality.grade import assess
 from calib.wand.recalibration import recalibrate_camera
 from calib.wand.scale import Distance
 from camera_node.foundation.errors import ConfigError
@@ -110,7 +110,7 @@ class Wand(WandOptions):
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
     ) -> Rig:
         if self.widen_lenses > 1:
-            rig = widen_lenses(rig, self.widen_lenses)
+            rig = msgspec.structs.replace(rig, cameras=widen_lenses(rig.cameras, self.widen_lenses))
         placed = (
             self._calibrate_all(rig, wand, messages, distance)
             if self.only is None

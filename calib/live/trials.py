@@ -16,7 +16,7 @@ from multiprocessing import get_context, parent_process
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.assessment import assess
+from calib.wand.quality.grade import assess
 from calib.wand.scale import Distance
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

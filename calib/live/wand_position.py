@@ -9,9 +9,8 @@ import numpy as np
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
 from calib.rig.triangulation import triangulate_point
-from calib.wand.detections import WandDetections, gather
-from calib.wand.labeling.labels import label
-from calib.wand.timing import MAX_SPREAD_S, Timing
+from calib.wand.detections import MAX_SPREAD_S, Timing, WandDetections, gather
+from calib.wand.labels import label
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

@@ -17,6 +17,9 @@ Visibility = Callable[[Camera, Array], Mask]
 
 MIN_ANGLE = 0.01  # rad between viewing rays, about: rays that are closer to parallel fix no point
 ITERATIONS = 8
+REWEIGHTINGS = 8  # of many rays at once
+RAY_ANGLE = 0.003  # scale of Cauchy's weights of these: angle between a ray and the point, radians
+MIN_INFORMATION_RATIO = 1e-4  # along the worst and the best axis, below which these rays are parallel
 
 
 def triangulate_point(cameras: Sequence[Camera], uv: ArrayLike) -> Array:
@@ -44,6 +47,27 @@ def triangulate_point(cameras: Sequence[Camera], uv: ArrayLike) -> Array:
     if not np.isfinite(p).all():
         raise CalibrationError("the viewing rays meet behind the cameras")
     return p
+
+
+def intersect(ray: Array, centre: Array, known: Mask, rounds: int = REWEIGHTINGS) -> tuple[Array, Array]:
+    """Return points (M, K, 3) nearest to `known` (C, M, K) rays (C, M, K, 3) through centres (C, 3), and the rays'
+    angles (C, M, K) to them; points are NaN where fewer than two rays are known, or they are nearly parallel.
+    The first of the rounds weighs all rays alike."""
+    across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
+    toward = np.einsum("cmkij,cj->cmki", across, centre)
+    weight = known.astype(float)
+    points, angle = np.full((*known.shape[1:], 3), np.nan), np.zeros(known.shape)
+    for _ in range(rounds):
+        A, b = np.einsum("cmk,cmkij->mkij", weight, across), np.einsum("cmk,cmki->mki", weight, toward)
+        spread = np.linalg.eigvalsh(A)
+        solvable = (known.sum(axis=0) >= 2) & (spread[..., 0] > MIN_INFORMATION_RATIO * spread[..., 2])
+        points[:] = np.nan
+        points[solvable] = np.linalg.solve(A[solvable], b[solvable][:, :, None])[:, :, 0]
+        away = np.nan_to_num(points) - centre[:, None, None]
+        angle = np.linalg.norm(np.einsum("cmkij,cmkj->cmki", across, away), axis=3)
+        angle /= np.maximum(np.linalg.norm(away, axis=3), 1e-9)
+        weight = known / (angle**2 + RAY_ANGLE**2) * RAY_ANGLE**2
+    return points, angle
 
 
 def _nearest_to_rays(cameras: Sequence[Camera], uv: Array) -> Array:

@@ -1,40 +1,80 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The wand calibration: label the detections, build an initial rig, adjust it, and report.
+"""The wand calibration, top to bottom.
 
-`calibrate` is the pipeline. Its steps are in `labeling`, `initialization`, `adjustment` and `conclusion`.
+`calibrate` labels the detections, solves for the cameras, and concludes. To solve is: two-view geometry, an initial
+rig, and its adjustment in stages (`adjust_rig`); without cameras that contradict the others, and again without
+detections that are under the wrong camera. The first stage is robust on few frame sets, the second exact on more, with
+the clocks that the first one shows; last, a part of the recording is held out.
 """
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from itertools import combinations
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
+from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig
 from calib.rig.wand_file import check_diameter
-from calib.wand.adjustment import RoughRig, Solution, adjust_rig
-from calib.wand.background import gather_background
-from calib.wand.bundle_adjustment.problem_setup import LabeledRecording
-from calib.wand.conclusion import Placement, conclude
-from calib.wand.detections import count_frames
-from calib.wand.initialization.diagnosis import explain_unplaced, find_faults
-from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
-from calib.wand.initialization.two_view import MIN_FRAME_SETS, MIN_INLIER_RATIO, TwoViewGeometry
-from calib.wand.labeling.labels import WandRecording
-from calib.wand.quality.checks import check_motion
-from calib.wand.quality.exchanges import FoundExchanges, find_exchanges
-from calib.wand.report import NOT_RECORDED, Exchange
-from calib.wand.result import WandCalibration
+from calib.wand.bundle_adjustment.covariance import estimate_lens_priors, inflate_covariance
+from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
+from calib.wand.bundle_adjustment.optimizer import adjust, optimize, optimize_robustly
+from calib.wand.bundle_adjustment.problem import (
+    Adjusted,
+    Estimate,
+    State,
+    WandObservations,
+)
+from calib.wand.bundle_adjustment.problem_setup import add_background, build_problem
+from calib.wand.clock_model import ClockModel, choose_clocks, clock_candidates, find_jump, with_readout_times
+from calib.wand.conclusion import Placement, Solution, conclude
+from calib.wand.detections import (
+    MIN_COINCIDENT,
+    WandRecording,
+    coincident_share,
+    count_frames,
+    gather_background,
+)
+from calib.wand.initial_rig import (
+    InitialRig,
+    TwoViewGeometry,
+    build_initial_rig,
+    explain_disagreement,
+    explain_failure,
+    explain_unplaced,
+    find_faults,
+)
+from calib.wand.labels import label_recording
+from calib.wand.quality.checks import (
+    check_clocks,
+    check_lenses,
+    check_motion,
+    check_sizes,
+    check_spacing,
+    find_exchanges,
+    triangulated_residuals,
+)
 from calib.wand.scale import Distance
-from calib.wand.synchrony import label_by_timing
-from camera_node.foundation.arrays import Index
+from calib.wand.trajectory import acceleration_density
+from calib.wand.wand_report import NOT_RECORDED, Exchange, WandCalibration
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
 MIN_REJECTED = 0.01  # share of rejected observations, from which they are explained
 MAX_EXCHANGE_PASSES = 3  # each finds more, because the rig and the motion are better
+BUDGET = 80  # instants that either model of synchronous cameras is fitted to
+# Interpolation averages the noise of two frames, which by itself lowers residuals by up to 8 %: midway, the weights of
+# the cubic polynomial give half of the variance to one of two cameras.
+MIN_GAIN = 1.1  # ratio of the residuals without and with clock offsets, from which offsets are preferred
+ROLLING = "the rows of rolling shutters are captured one after another, so the wand's motion matters"
+COARSE_SETS, FINE_SETS = 250, 1000  # frame sets of either stage
+MAX_MEASURED = 20_000  # detections whose residuals are stated
+# Runs of consecutive instants are held out, or fitted, together, so that tracks can be interpolated within them: one in
+# `PARTS` is held out.
+RUN, PARTS = 8, 5
+MIN_AGREEING = 0.5  # share of a camera's detections that must fit the rig
 
 
 def calibrate(
@@ -75,10 +115,11 @@ def calibrate(
     if not len(recording.detections):
         raise CalibrationError(_explain_no_wand(recording))
     check_motion(recording.detections, recording.names, recording.lenses)
-    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.timing)
-    placement, solution = _solve_without_exchanged(recording, pairs, distance)
+    placement, solution = _solve_without_exchanged(recording, distance)
     absent = {name: NOT_RECORDED for name in rig.cameras if name not in recording.names}
-    return conclude(rig, solution, replace(placement, unplaced=placement.unplaced | absent, timing=timing))
+    placement = replace(placement, unplaced=placement.unplaced | absent, timing=timing)
+    jump = find_jump(placement.recording.names, solution.adjusted, solution.observations)
+    return conclude(rig, solution, placement, jump)
 
 
 def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
@@ -106,48 +147,107 @@ def check_cameras(rig: Rig, messages: Sequence[Detections], of: str) -> None:
         )
 
 
-@dataclass(slots=True)
-class _Excluded:
-    """Cameras that contradict the others, by name with the reason; `certain` ones are known to be the cause."""
-
-    reasons: dict[str, str] = field(default_factory=dict)
-    certain: dict[str, str] = field(default_factory=dict)
-
-    def add(self, fault: CameraFault) -> None:
-        self.reasons |= fault.reasons
-        self.certain |= fault.reasons if fault.certain else {}
+def _explain_no_wand(recording: WandRecording) -> str:
+    reasons = sum(recording.left_out, Counter())
+    counts = ", ".join(f"{reason}: {n}" for reason, n in reasons.most_common())
+    return f"the wand was in no frame ({counts}); do the wand file's diameter and markers match the wand?"
 
 
-def _solve_majority(
-    recording: WandRecording, pairs: TwoViewGeometry, distance: Distance | None
-) -> tuple[Placement, Solution]:
-    """Solve for the cameras that agree; exclude those that contradict them, until a majority is consistent.
+def label_by_timing(
+    rig: Rig, wand: Body, messages: Sequence[Detections], synchronous: bool
+) -> tuple[WandRecording, str]:
+    """Label a recording as that of synchronous or of other cameras, and return the reason.
+
+    Equal stamps may come from a common trigger, or from software that numbers frames of cameras that run freely. Both
+    models, without and with clock offsets, are fitted to one half of the instants; the residuals of the other half
+    decide.
+
+    Args:
+        rig: its cameras.
+        wand: its markers.
+        messages: the recording.
+        synchronous: whether the user declares the cameras synchronous; otherwise the recording decides.
 
     Raises:
-        CalibrationError: fewer than two cameras can be placed, or at most half of them agree.
+        CalibrationError: cameras are declared synchronous, but no stamps are equal; or see `labels.label`.
     """
-    excluded = _Excluded()
-    while True:
-        included = [k for k, name in enumerate(recording.names) if name not in excluded.reasons]
-        start = build_initial_rig(pairs, included)
-        placement = _place(recording, pairs, start, excluded, distance)
-        known = placement.scaled_by and placement.scaled_by.between(placement.names, placement.unplaced)
-        poses, offset_s = (
-            np.array([column[k] for k in start.placed]) for column in (start.poses, start.offset_s)
+    by_clocks = label_recording(rig, wand, messages)
+    share = coincident_share(by_clocks.frames)
+    if synchronous:
+        if share == 0 and not _any_equal(by_clocks):
+            raise CalibrationError(
+                "the cameras are declared synchronous, but no two cameras have frames with equal stamps; leave out "
+                "--synchronised, or give simultaneous frames the same t_ns"
+            )
+        if by_clocks.frames.readout_s.any():
+            return by_clocks, f"synchronous cameras: declared, but {ROLLING}"
+        return label_recording(rig, wand, messages, synchronous=True), "synchronous cameras: declared"
+    if share < MIN_COINCIDENT:
+        return (
+            by_clocks,
+            f"clock offsets are estimated: only {share:.0%} of a camera's frames share their stamps",
         )
-        labeled = LabeledRecording.of(recording, pairs, start.placed)
-        try:
-            return placement, adjust_rig(labeled, RoughRig(poses, offset_s, start.metric, known))
-        except CameraFault as fault:
-            excluded.add(fault)
-            if len(start.placed) - len(fault.reasons) <= len(excluded.reasons):
-                raise CalibrationError(
-                    explain_disagreement(recording.names, pairs, excluded.reasons)
-                ) from None
+    if by_clocks.frames.readout_s.any():
+        return by_clocks, f"clock offsets are estimated, although frames share their stamps: {ROLLING}"
+    by_stamps = label_recording(rig, wand, messages, synchronous=True)
+    return _prefer(by_stamps, by_clocks, share)
+
+
+def _any_equal(recording: WandRecording) -> bool:
+    """Whether any two cameras have frames with the same stamp."""
+    t_s, camera = recording.frames.t_s, recording.frames.camera
+    order = np.argsort(t_s, kind="stable")
+    return bool(((np.diff(t_s[order]) == 0) & (np.diff(camera[order]) != 0)).any())
+
+
+def _prefer(by_stamps: WandRecording, by_clocks: WandRecording, share: float) -> tuple[WandRecording, str]:
+    """Return the recording whose model fits held-out instants better, and the reason."""
+    by_model = [_fit_half(recording) for recording in (by_stamps, by_clocks)]
+    cameras, clocks_px = [placed for placed, _, _ in by_model], by_model[1][1]
+    # The motion model of the second also makes poses and lenses better: offsets must explain the difference.
+    stamps_px = min(without_px for _, _, without_px in by_model)
+    equal = f"at least {share:.0%} of each camera's frames share their stamps with another camera"
+    if cameras[0] != cameras[1]:
+        held_out = f"{cameras[0]} cameras can be placed without clock offsets, {cameras[1]} with"
+        prefer_stamps = cameras[0] > cameras[1]
+    else:
+        figures = f"{stamps_px:.2f} px without clock offsets, {clocks_px:.2f} px with"
+        held_out = f"median residual of held-out instants {figures}"
+        prefer_stamps = not stamps_px > MIN_GAIN * clocks_px
+    if prefer_stamps:
+        return by_stamps, f"synchronous cameras: {equal}; {held_out}"
+    return by_clocks, f"clock offsets are estimated, although {equal}: {held_out}"
+
+
+def _fit_half(recording: WandRecording) -> tuple[int, float, float]:
+    """Fit every other run of instants; return the number of cameras placed, and the median residuals of the others,
+    pixels, with and without the clocks that were found; infinite where nothing can be fitted."""
+    instant = recording.timing.instants(recording.detections.t_s)
+    fitted = (instant // RUN) % 2 == 0
+    half = recording.select(fitted)
+    start = build_initial_rig(
+        TwoViewGeometry(half.detections, half.lenses, half.wand, half.timing), range(len(half.names))
+    )
+    if len(start.placed) < 2:
+        return 0, np.inf, np.inf
+    try:
+        rough = scale_rig(RoughRig.of(start))
+        state = adjust_coarsely(half.of_cameras(start.placed), rough, BUDGET).state
+    except CalibrationError:
+        return 0, np.inf, np.inf
+    rest = recording.select(~fitted).of_cameras(start.placed)
+    without = replace(state, clocks=np.zeros_like(state.clocks))
+    return len(start.placed), _median_residual(rest, state), _median_residual(rest, without)
+
+
+def _median_residual(recording: WandRecording, state: State) -> float:
+    norms = np.linalg.norm(triangulated_residuals(recording, state).pixels, axis=1)
+    norms = norms[np.isfinite(norms)]
+    return float(np.median(norms)) if len(norms) else np.inf
 
 
 def _solve_without_exchanged(
-    recording: WandRecording, pairs: TwoViewGeometry, distance: Distance | None
+    recording: WandRecording, distance: Distance | None
 ) -> tuple[Placement, Solution]:
     """Solve, leave out detections that are under the wrong camera, and solve again, until there are few or none.
 
@@ -155,36 +255,52 @@ def _solve_without_exchanged(
         CalibrationError: as in `_solve_majority`.
     """
     shares: Counter[tuple[str, str]] = Counter()
-    placement, solution = _solve_majority(recording, pairs, distance)
+    placement, solution = _solve_majority(recording, distance)
     for _ in range(MAX_EXCHANGE_PASSES):
-        placed = [recording.names.index(name) for name in placement.names]
-        found = _find_exchanges(recording, pairs, placed, solution)
+        if solution.adjusted.used.mean() > 1 - MIN_REJECTED and not recording.timing.synchronous:
+            break
+        found = find_exchanges(placement.recording, solution.adjusted, solution.observations)
         if found is None:
             break
         shares.update({(pair.shown, pair.of): pair.share for pair in found.pairs})
+        placed = [recording.names.index(name) for name in placement.recording.names]
         mine = np.flatnonzero(np.isin(recording.detections.camera, placed))
-        detections = recording.detections.select(mine[found.tested & ~found.wrong])
-        recording, pairs = replace(recording, detections=detections), pairs.with_detections(detections)
-        placement, solution = _solve_majority(recording, pairs, distance)
+        recording = recording.select(mine[found.tested & ~found.wrong])
+        placement, solution = _solve_majority(recording, distance)
     exchanges = tuple(Exchange(*names, share) for names, share in shares.most_common())
     return replace(placement, exchanges=exchanges), solution
 
 
-def _find_exchanges(
-    recording: WandRecording, pairs: TwoViewGeometry, placed: list[int], solution: Solution
-) -> FoundExchanges | None:
-    """Find the detections of cameras that are under the wrong one; None if the adjustment used nearly all."""
-    if solution.adjusted.used.mean() > 1 - MIN_REJECTED and not recording.timing.synchronous:
-        return None
-    labeled = LabeledRecording.of(recording, pairs, placed)
-    return find_exchanges(labeled, solution.adjusted, solution.observations)
+def _solve_majority(recording: WandRecording, distance: Distance | None) -> tuple[Placement, Solution]:
+    """Solve for the cameras that agree; exclude those that contradict them, until a majority is consistent.
+
+    Raises:
+        CalibrationError: fewer than two cameras can be placed, or at most half of them agree.
+    """
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, recording.wand, recording.timing)
+    excluded: dict[str, str] = {}  # the reason, by name of the camera
+    certain: dict[str, str] = {}  # of those that are known to be the cause
+    while True:
+        included = [k for k, name in enumerate(recording.names) if name not in excluded]
+        start = build_initial_rig(pairs, included)
+        placement = _place(recording, pairs, start, excluded, certain, distance)
+        known = placement.scaled_by
+        between = known and known.between(placement.recording.names, placement.unplaced)
+        try:
+            return placement, adjust_rig(placement.recording, RoughRig.of(start, between))
+        except CameraFault as fault:
+            excluded |= fault.reasons
+            certain |= fault.reasons if fault.certain else {}
+            if len(start.placed) - len(fault.reasons) <= len(excluded):
+                raise CalibrationError(explain_disagreement(recording.names, pairs, excluded)) from None
 
 
 def _place(
     recording: WandRecording,
     pairs: TwoViewGeometry,
     start: InitialRig,
-    excluded: _Excluded,
+    excluded: dict[str, str],
+    certain: dict[str, str],
     distance: Distance | None,
 ) -> Placement:
     """Collect what the initial rig places, and the reasons why it does not place the other cameras.
@@ -192,20 +308,15 @@ def _place(
     Raises:
         CalibrationError: it places fewer than two.
     """
-    names, placed = recording.names, start.placed
+    names = recording.names
     counts, shared = count_frames(recording.detections, len(names)), pairs.count_shared()
-    faults = find_faults(names, recording.frames, pairs, placed)
-    unplaced = explain_unplaced(names, counts, shared, start) | excluded.reasons | faults | excluded.certain
-    if len(placed) < 2:
-        faults = excluded.reasons | faults
-        raise CalibrationError(
-            _explain_faults(faults) if faults else _explain_failure(names, counts, shared, unplaced)
-        )
-    by_distance = len(pairs.wand.markers) == 1
+    faults = find_faults(names, recording.frames, pairs, start.placed)
+    unplaced = explain_unplaced(names, counts, shared, start) | excluded | faults | certain
+    if len(start.placed) < 2:
+        raise CalibrationError(explain_failure(names, counts, shared, unplaced, excluded | faults))
+    by_distance = len(recording.wand.markers) == 1
     return Placement(
-        names=[names[k] for k in placed],
-        frames=[counts[k] for k in placed],
-        left_out=[recording.left_out[k] for k in placed],
+        recording.of_cameras(start.placed),
         unplaced=unplaced,
         metric=start.metric,
         scaled_by=distance if by_distance else None,
@@ -213,46 +324,171 @@ def _place(
     )
 
 
-def explain_disagreement(names: Sequence[str], pairs: TwoViewGeometry, reasons: dict[str, str]) -> str:
-    """State which pairs of cameras agree by themselves, and what would reconcile the others."""
-    agreeing = []
-    for a, b in combinations(range(len(names)), 2):
-        pair = pairs.relate(a, b)
-        if pair is not None and pair.inlier_ratio >= MIN_INLIER_RATIO:
-            agreeing.append(f"'{names[a]}' and '{names[b]}' ({pair.inlier_ratio:.0%} of their detections)")
-    which = ", ".join(agreeing) if agreeing else "none"
-    return (
-        f"half of the cameras or more contradict each other: {CameraFault(reasons)}. Pairs that agree "
-        f"by themselves: {which}. Record again with cameras and clocks that nothing moves, or leave cameras out"
+@dataclass(frozen=True, slots=True)
+class RoughRig:
+    """The start of an adjustment.
+
+    Attributes:
+        cameras: (C, 4, 4) T_world_cam.
+        offset_s: (C,) true time = stamp + offset.
+        metric: whether the start has the world's scale.
+        distance: two cameras and their measured distance, which gives the scale where the wand has no length.
+    """
+
+    cameras: Array
+    offset_s: Array
+    metric: bool
+    distance: tuple[int, int, float] | None = None
+
+    @classmethod
+    def of(cls, start: InitialRig, distance: tuple[int, int, float] | None = None) -> "RoughRig":
+        """The placed cameras of an initial rig, ascending."""
+        poses, offset_s = (
+            np.array([column[k] for k in start.placed]) for column in (start.poses, start.offset_s)
+        )
+        return cls(poses, offset_s, start.metric, distance)
+
+
+def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
+    """Adjust a rough rig by a recording of the wand.
+
+    Where nothing gives the scale, the two cameras farthest apart are put 1 m apart.
+
+    Raises:
+        CalibrationError: the wand's lengths do not fit the observations or the roundels' sizes.
+        CameraFault: a camera's lens differs from its file, or its observations contradict those of the others.
+    """
+    rough = scale_rig(rough)
+    coarse = adjust_coarsely(recording, rough)
+    check_lenses(recording.names, coarse)
+    check_clocks(recording.names, coarse)
+    coarse = inflate_covariance(coarse)
+    clocks = choose_clocks(coarse)
+    fine = _prepare_fine(recording, rough, coarse, clocks)
+    solution = _adjust_finely(fine, coarse.inflation)
+    check_agreement(recording.names, solution.adjusted, solution.observations)
+    if rough.metric:
+        check_sizes(recording.wand, solution.adjusted, solution.observations)
+        check_spacing(recording.wand, solution.adjusted, solution.observations)
+    solution = replace(solution, adjusted=inflate_covariance(solution.adjusted))
+    return _validate(recording, solution)
+
+
+def scale_rig(rough: RoughRig) -> RoughRig:
+    """The rig scaled to the measured distance, or to 1 m between the farthest cameras if it has no scale."""
+    if rough.distance is None and rough.metric:
+        return rough
+    a, b, wanted = rough.distance or (*_farthest(rough.cameras)[:2], 1.0)
+    cameras = rough.cameras.copy()
+    cameras[:, :3, 3] *= wanted / np.linalg.norm(cameras[a, :3, 3] - cameras[b, :3, 3])
+    return replace(rough, cameras=cameras)
+
+
+def _farthest(cameras: Array) -> tuple[int, int, float]:
+    gaps = np.linalg.norm(cameras[:, None, :3, 3] - cameras[None, :, :3, 3], axis=2)
+    a, b = np.unravel_index(int(gaps.argmax()), gaps.shape)
+    return int(a), int(b), float(gaps[a, b])
+
+
+def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Adjusted:
+    """Adjust poses, clocks and lenses on about `budget` frame sets, after a robust optimization of poses and clocks."""
+    start = _build(recording, rough, budget)
+    problem = start.problem.with_free(POSE, *clock_candidates(recording.timing, start.problem))
+    state = optimize_robustly(problem, start.observations, start.state)
+    # Noise in the rough positions looks like acceleration: the first density makes the motion prior too weak, so the
+    # motion absorbs noise and the residuals are too small.
+    density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.timing.gap_s)
+    problem = replace(problem.with_free(problem.free, LENS), density=density)
+    observations = with_disc_centres(problem, state, start.observations, recording.wand)
+    return with_readout_times(adjust(problem, observations, state), observations, recording.timing)
+
+
+def _build(recording: WandRecording, rough: RoughRig, budget: int) -> Estimate:
+    start = build_problem(recording, rough.cameras, rough.offset_s, budget)
+    if start is None:
+        raise CalibrationError(
+            "the wand's lengths do not fit the detections; check the wand file, and that the rig file has the "
+            "intrinsics of these cameras"
+        )
+    if len(start.problem.wand.lengths):
+        return start
+    distance = rough.distance or _farthest(rough.cameras)
+    return replace(start, problem=replace(start.problem, fixed_distance=distance))
+
+
+def _prepare_fine(
+    recording: WandRecording, rough: RoughRig, coarse: Adjusted, clocks: ClockModel
+) -> Estimate:
+    """The problem of the fine stage, from the coarse stage's cameras, lenses and clocks."""
+    lenses = [coarse.state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
+    better = replace(rough, cameras=coarse.state.cameras, offset_s=clocks.clocks[:, 0])
+    start = _build(recording.undistort_tracks(lenses), better, FINE_SETS)
+    state = replace(start.state, clocks=clocks.clocks, lenses=coarse.state.lenses)
+    density = acceleration_density(coarse.problem.knot_s, coarse.state.motion[:, 0], recording.timing.gap_s)
+    problem = start.problem.with_free(POSE, LENS, *clocks.free)
+    problem = replace(problem, density=density, drift_sigma=clocks.drift_sigma)
+    observations = with_disc_centres(problem, state, start.observations, recording.wand)
+    return add_background(recording, Estimate(problem, state, observations))
+
+
+def _adjust_finely(fine: Estimate, inflation: float) -> Solution:
+    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these."""
+    first = adjust(fine.problem, fine.observations, fine.state, rounds=1)
+    problem = estimate_lens_priors(fine.problem, replace(first, inflation=inflation))
+    return Solution(adjust(problem, fine.observations, first.state, profiled=True), fine.observations)
+
+
+def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: WandObservations) -> None:
+    """Raise CameraFault where most detections of a camera contradict those of the other cameras.
+
+    Only the worst camera is named, because a wrong camera makes others look wrong. The d parameters of a camera's pose
+    and clock fit d coordinates of any detections, so these do not count.
+    """
+    total = np.bincount(observations.camera, minlength=len(names))
+    fitting = np.bincount(observations.camera[adjusted.used], minlength=len(names))
+    share = (fitting - len(set(adjusted.problem.free) - set(LENS)) / 2) / total
+    if share.min() < MIN_AGREEING:
+        k = int(share.argmin())
+        jump = find_jump(names, adjusted, observations)
+        if jump is not None and jump.camera == names[k]:
+            raise CameraFault({names[k]: jump.sentence()}, certain=False)
+        reason = (
+            f"only {fitting[k]} of its {total[k]} detections fit those of the other cameras: if it has few, wave the "
+            "wand in front of it; else check that its name and its intrinsics are its own and that it did not move; "
+            f"run roundel calibrate intrinsics --camera {names[k]}, or leave it out"
+        )
+        raise CameraFault({names[k]: reason}, certain=False)
+
+
+def _validate(recording: WandRecording, solution: Solution) -> Solution:
+    """Measure the residuals of all detections, and of detections that are held out.
+
+    Of recordings with very many detections, those in the frame sets of the adjustment are measured.
+    """
+    adjusted, observations = solution.adjusted, solution.observations
+    measured = np.ones(len(recording.detections), bool)
+    if len(measured) > MAX_MEASURED:
+        measured = np.isin(np.arange(len(measured)), observations.row)
+    corrected = recording.with_centres(observations.row, observations.uv).select(measured)
+    given = triangulated_residuals(corrected, adjusted.state)
+    residuals = np.full(len(measured), np.nan)
+    residuals[measured] = np.linalg.norm(given.pixels, axis=1)
+    run = recording.timing.instants(corrected.detections.t_s) // RUN
+    last = np.zeros(len(measured), bool)
+    last[measured] = run % PARTS == PARTS - 1
+    held_out = corrected.select(last[measured])
+    without = _adjust_without(solution, last) if last.any() else None
+    return replace(
+        solution,
+        given=given.summary(),
+        held_out=triangulated_residuals(held_out, without).summary() if without is not None else None,
+        rejected_px=residuals[observations.row[~adjusted.used]],
     )
 
 
-def _explain_no_wand(recording: WandRecording) -> str:
-    reasons = sum(recording.left_out, Counter())
-    counts = ", ".join(f"{reason}: {n}" for reason, n in reasons.most_common())
-    return f"the wand was in no frame ({counts}); do the wand file's diameter and markers match the wand?"
-
-
-def _explain_faults(faults: dict[str, str]) -> str:
-    reasons = "; ".join(f"camera '{name}': {fault}" for name, fault in faults.items())
-    return f"no two cameras could be placed: {reasons}"
-
-
-def _explain_failure(names: list[str], counts: list[int], shared: Index, unplaced: dict[str, str]) -> str:
-    """Explain why no two cameras could be placed, from the frame sets (C, C) that they share."""
-    pairs = np.triu(shared, 1)
-    if not pairs.any():
-        frames = ", ".join(f"{name} {n}" for name, n in zip(names, counts, strict=True))
-        return (
-            f"no two cameras ever saw the wand at once (frames with the wand: {frames}); wave the wand where views "
-            "overlap"
-        )
-    if pairs.max() >= MIN_FRAME_SETS:
-        a, b = np.unravel_index(int(pairs.argmax()), pairs.shape)
-        return (
-            f"no two cameras could be placed, although '{names[a]}' and '{names[b]}' saw the wand at once "
-            f"{pairs.max()} times: their detections do not fit a wand with these markers; measure the wand, and check "
-            "the intrinsics of the cameras"
-        )
-    reasons = "; ".join(f"camera '{name}': {reason}" for name, reason in unplaced.items())
-    return f"no two cameras could be placed; wave the wand where two cameras see it at once ({reasons})"
+def _adjust_without(solution: Solution, held_out: Mask) -> State | None:
+    """The state adjusted without some detections (n,) of the recording, from the state with them; None where fewer than
+    two frame sets remain."""
+    whole = Estimate(solution.adjusted.problem, solution.adjusted.state, solution.observations)
+    part = whole.select(~held_out[solution.observations.row])
+    return None if part is None else optimize(part.problem, part.observations, part.state)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Turns the solution of a wand recording into the calibrated rig and its report."""
 
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -9,21 +9,44 @@ import numpy as np
 
 from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT, Camera
 from calib.rig.rig import Rig
-from calib.wand.adjustment import Solution
-from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
-from calib.wand.bundle_adjustment.eliminated_points import point_residuals
-from calib.wand.bundle_adjustment.lens_prior import parameter_sigma
-from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import State, WandObservations
+from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance, parameter_sigma
+from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations, gauge_directions
+from calib.wand.bundle_adjustment.residuals import point_residuals
+from calib.wand.detections import WandRecording
 from calib.wand.quality.checks import measure_lengths
-from calib.wand.quality.clock_jump import find_jump
 from calib.wand.quality.lenses import find_lens_changes
-from calib.wand.report import BackgroundReport, CameraReport, Exchange, Outlier, WandReport
-from calib.wand.result import WandCalibration
-from calib.wand.scale import Distance, add_scale_uncertainty, compare_distance
+from calib.wand.scale import Distance, DistanceComparison
+from calib.wand.wand_report import (
+    BackgroundReport,
+    CameraReport,
+    ClockJump,
+    Exchange,
+    Outlier,
+    Validation,
+    WandCalibration,
+    WandReport,
+)
 from calib.world.world_frame import move_rig, upright_frame
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The adjusted rig, and its observations of the discs' own centres.
+
+    Attributes:
+        given: residuals of all detections of the recording, whether the adjustment used them or not.
+        held_out: residuals of a fifth of the instants, at the rig adjusted without these.
+        rejected_px: (r,) distances of the rejected observations from where the other cameras see the marker, pixels;
+            NaN where none does.
+    """
+
+    adjusted: Adjusted
+    observations: WandObservations
+    given: Validation | None = None
+    held_out: Validation | None = None
+    rejected_px: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +54,7 @@ class Placement:
     """Which cameras the initial rig places, and how the scale is known.
 
     Attributes:
-        names: of the placed cameras, the order of `frames` and `left_out`.
-        frames: number of frames with the wand.
-        left_out: number of frames without it, by reason.
+        recording: of the placed cameras.
         unplaced: the reason for each other camera.
         metric: whether the wand gives the scale.
         scaled_by: the measured distance that gives the scale.
@@ -42,9 +63,7 @@ class Placement:
         exchanges: cameras that show points of others, which were left out.
     """
 
-    names: list[str]
-    frames: list[int]
-    left_out: list[Counter[str]]
+    recording: WandRecording
     unplaced: dict[str, str]
     metric: bool
     scaled_by: Distance | None
@@ -53,7 +72,7 @@ class Placement:
     exchanges: tuple[Exchange, ...] = ()
 
 
-def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibration:
+def conclude(rig: Rig, solution: Solution, placement: Placement, jump: ClockJump | None) -> WandCalibration:
     """Build the result: the rig in an upright world, clocks relative to their median, and the report."""
     adjusted, observations = solution.adjusted, solution.observations
     if placement.scaled_by is not None:
@@ -63,11 +82,11 @@ def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibrat
     drift, drift_sigma = clock_values(adjusted.state, covariance, DRIFT, 1e6)
     readout, readout_sigma = clock_values(adjusted.state, covariance, READOUT, 1e3)
     offsets, drift = offsets - np.median(offsets), drift - drift.mean()
-    size = 6 * len(placement.names)
+    size = 6 * len(placement.recording.names)
     return WandCalibration(
         rig=_place(rig, adjusted, covariance, placement, offsets),
         report=_build_report(replace(solution, adjusted=adjusted), covariance, placement),
-        names=placement.names,
+        names=placement.recording.names,
         adjusted=adjusted,
         observations=observations,
         covariance=covariance.of(POSE).reshape(size, size),
@@ -77,7 +96,7 @@ def conclude(rig: Rig, solution: Solution, placement: Placement) -> WandCalibrat
         drift_sigma_ppm=drift_sigma,
         readout_ms=readout + 1e3 * adjusted.problem.readout_s,
         readout_sigma_ms=readout_sigma,
-        jump=find_jump(placement.names, adjusted, observations),
+        jump=jump,
     )
 
 
@@ -116,7 +135,7 @@ def _place(
     cameras = dict(rig.cameras)
     for name in placement.unplaced:
         cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
-    for k, name in enumerate(placement.names):
+    for k, name in enumerate(placement.recording.names):
         cameras[name] = adjusted_camera(cameras[name], adjusted, covariance, k, float(offset_ms[k]))
     state = adjusted.state
     T_world = upright_frame(state.cameras, state.motion[:, 0].reshape(-1, 3))
@@ -125,11 +144,12 @@ def _place(
 
 def _build_report(solution: Solution, covariance: CameraCovariance, placement: Placement) -> WandReport:
     adjusted, observations = solution.adjusted, solution.observations
-    names, distance = placement.names, placement.compared_with
+    names, distance = placement.recording.names, placement.compared_with
     lengths, cov = measure_lengths(adjusted, observations), covariance.of(POSE)
     return WandReport(
         cameras=[
-            _report_camera(placement, k, observations, adjusted, cov[k, :, k]) for k in range(len(names))
+            _report_camera(placement.recording, k, observations, adjusted, cov[k, :, k])
+            for k in range(len(names))
         ],
         unplaced=placement.unplaced,
         wand_poses=len(adjusted.problem.knot_s),
@@ -161,20 +181,20 @@ def _report_background(adjusted: Adjusted) -> BackgroundReport | None:
 
 
 def _report_camera(
-    placement: Placement, k: int, observations: WandObservations, adjusted: Adjusted, cov: Array
+    recording: WandRecording, k: int, observations: WandObservations, adjusted: Adjusted, cov: Array
 ) -> CameraReport:
     mine = observations.camera == k
     used = mine & adjusted.used
     rms = float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())) if used.any() else float("nan")
     return CameraReport(
-        name=placement.names[k],
-        frames=placement.frames[k],
+        name=recording.names[k],
+        frames=len(np.unique(recording.detections.frame[recording.detections.camera == k])),
         frames_used=len(np.unique(observations.t_s[used])),
         observations=int(used.sum()),
         outliers=int((mine & ~adjusted.used).sum()),
         residual_px=rms,
         sigma_mm=float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
-        left_out=dict(placement.left_out[k]),
+        left_out=dict(recording.left_out[k]),
     )
 
 
@@ -194,3 +214,46 @@ def _list_outliers(names: list[str], solution: Solution) -> list[Outlier]:
         )
         for row in rows[np.argsort(-distance[rows])]
     ]
+
+
+def compare_distance(
+    distance: Distance, names: Sequence[str], adjusted: Adjusted
+) -> DistanceComparison | None:
+    """Compare a measured distance with the adjusted poses; None if one of the two cameras is not placed.
+
+    Args:
+        distance: the measured one.
+        names: of the adjusted cameras.
+        adjusted: the adjustment.
+    """
+    if distance.a not in names or distance.b not in names:
+        return None
+    ends = [names.index(distance.a), names.index(distance.b)]
+    first, second = adjusted.state.cameras[ends]
+    gap = first[:3, 3] - second[:3, 3]
+    length = float(np.linalg.norm(gap))
+    J = np.concatenate([gap @ first[:3, :3], -gap @ second[:3, :3]]) / length
+    cov = camera_covariance(adjusted).of(POSE)[np.ix_(ends, range(3, 6), ends, range(3, 6))].reshape(6, 6)
+    return DistanceComparison(distance, length, float(np.sqrt(J @ cov @ J + distance.sigma_m**2)))
+
+
+def add_scale_uncertainty(adjusted: Adjusted, distance: Distance) -> Adjusted:
+    """Add the uncertainty of the distance that gave the scale, which the adjustment took as exact.
+
+    The covariance S becomes S + s^2 g g', for the relative standard deviation s of the distance and the derivative g of
+    the cameras by the scale of the world, without its component along the gauge. In the information matrix this is a
+    downdate of rank one (Sherman and Morrison).
+    """
+    relative = distance.sigma_m / distance.metres / (adjusted.scale * adjusted.inflation**0.5)
+    if relative == 0:
+        return adjusted
+    free, cameras = adjusted.problem.free, adjusted.state.cameras
+    by_scale = np.zeros((len(cameras), len(free)))
+    translations = [free.index(p) for p in POSE[3:]]
+    by_scale[:, translations] = np.einsum("cji,cj->ci", cameras[:, :3, :3], cameras[:, :3, 3])
+    gauge = np.linalg.qr(gauge_directions(adjusted.state, free))[0]
+    g = by_scale.ravel() - gauge @ (gauge.T @ by_scale.ravel())
+    weighted = adjusted.information @ g
+    weighted -= gauge @ (gauge.T @ weighted)
+    lost = np.outer(weighted, weighted) / (relative**-2 + g @ weighted)
+    return replace(adjusted, information=adjusted.information - lost)

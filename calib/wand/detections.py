@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The detections of all cameras as columns: one row per detection, frames and cameras by index."""
+"""The detections of a recording as columns, how its frames are related in time, and the image tracks of markers.
 
+One row per detection, frames and cameras by index.
+"""
+
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.errors import CalibrationError
 from calib.rig.camera import Camera
+from calib.wand.trajectory import hermite
 from camera_node.foundation.arrays import Array, Index
+from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import RawEllipses
 from camera_node.protocol.messages import Detections
@@ -25,6 +32,15 @@ COLUMNS = {
     "angle_rad": ("<f4", 1),
     "id": ("<i4", 1),
 }
+MAX_GAP_PERIODS, MAX_GAP_S = 2.5, 0.5  # longest interpolation of a track: frame periods, and seconds
+MAX_SPREAD_S = 0.1  # a hand moves decimetres in this time
+MIN_SPREAD_S = (
+    0.02  # frames this close form one set at any frame rate: the motion between them is interpolated
+)
+# Share of each camera's frames that share a stamp with another camera, from which cameras may be synchronous. Stamps of
+# free-running cameras, rounded to milliseconds, coincide by chance for 40 % of the frames of eight cameras at 60 Hz.
+MIN_COINCIDENT = 0.8
+SAME_S = 1e-6  # stamps closer than this are equal: they are whole nanoseconds, here as seconds
 
 
 class Ellipses(RawEllipses, Protocol):
@@ -189,3 +205,216 @@ def count_frames(detections: WandDetections, cameras: int) -> list[int]:
     """Count the frames with detections, by camera."""
     first = np.flatnonzero(np.diff(detections.frame, prepend=-1))
     return np.bincount(detections.camera[first], minlength=cameras).tolist()
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """The relation of frames in time.
+
+    Attributes:
+        period_s: median time between the frames of a camera; 0 if unknown.
+        synchronous: frames with equal stamps are simultaneous; all others are unrelated, so neither clocks nor the
+            motion of the wand matter. Otherwise stamps may be offset, and tracks are interpolated in time.
+    """
+
+    period_s: float
+    synchronous: bool = False
+
+    @property
+    def gap_s(self) -> float:
+        """The longest time over which tracks and the wand's motion are interpolated; 0 for synchronous cameras."""
+        if self.synchronous:
+            return 0.0
+        return min(MAX_GAP_PERIODS * self.period_s, MAX_GAP_S) if self.period_s else MAX_GAP_S
+
+    @property
+    def spread_s(self) -> float:
+        """The longest time between the frames of one frame set: half a frame period, or 20 ms if that is longer."""
+        if self.synchronous:
+            return 0.0
+        if not self.period_s:
+            return MAX_SPREAD_S
+        return min(max(self.period_s / 2, min(self.period_s, MIN_SPREAD_S)), MAX_SPREAD_S)
+
+    def instants(self, t_s: Array) -> Index:
+        """(n,) numbers of the instants at which stamps (n,) lie: of equal stamps, or of frame periods."""
+        if self.synchronous or not self.period_s:
+            return np.unique(t_s, return_inverse=True)[1]
+        return np.floor((t_s - t_s.min(initial=np.inf)) / self.period_s).astype(np.intp)
+
+
+def coincident_share(frames: FrameTable) -> float:
+    """Return the share of frames whose stamp another camera's frame has too, of the camera with the smallest share."""
+    _, instant, count = np.unique(frames.t_s, return_inverse=True, return_counts=True)
+    shared = (count[instant] >= 2).astype(float)
+    cameras = np.unique(frames.camera)
+    return min(float(shared[frames.camera == camera].mean()) for camera in cameras)
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerTrack:
+    """One marker in one camera: timestamps (n,) ascending, positions (n, 2) and their velocities (n, 2)."""
+
+    t_s: Array
+    xy: Array
+    velocity: Array
+
+    @classmethod
+    def of(cls, t_s: Array, xy: Array) -> "MarkerTrack":
+        """Compute velocities by central differences."""
+        if len(t_s) < 2:
+            return cls(t_s, xy, np.zeros_like(xy))
+        step = np.diff(xy, axis=0) / np.diff(t_s)[:, None]
+        velocity = np.concatenate([step[:1], (step[1:] + step[:-1]) / 2, step[-1:]])
+        return cls(t_s, xy, velocity)
+
+    def interpolate(self, t_s: Array, gap_s: float) -> Array:
+        """Return positions (..., 2) at timestamps (...), by cubic Hermite polynomials; NaN in gaps above `gap_s`,
+        except at the track's own timestamps."""
+        if not len(self.t_s):
+            return np.full((*t_s.shape, 2), np.nan)
+        if len(self.t_s) == 1:
+            return np.where(np.abs(t_s - self.t_s[0])[..., None] < SAME_S, self.xy[0], np.nan)
+        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
+        tau, dt = t_s - self.t_s[after - 1], self.t_s[after] - self.t_s[after - 1]
+        inside = (tau >= -SAME_S) & (tau <= dt + SAME_S) & (dt <= gap_s)
+        inside |= np.minimum(np.abs(tau), np.abs(dt - tau)) < SAME_S
+        h = hermite(tau.ravel(), dt.ravel()).reshape(*t_s.shape, 4)
+        p, v = self.xy, self.velocity
+        found = h[..., :1] * p[after - 1] + h[..., 1:2] * v[after - 1]
+        found += h[..., 2:3] * p[after] + h[..., 3:] * v[after]
+        return np.where(inside[..., None], found, np.nan)
+
+
+def build_tracks(detections: WandDetections, cameras: int, markers: int) -> list[list[MarkerTrack]]:
+    """Return tracks by camera and marker, in undistorted image plane coordinates, by timestamps."""
+    tracks = []
+    for camera in range(cameras):
+        mine = detections.camera == camera
+        rows = [np.flatnonzero(mine & (detections.label == marker)) for marker in range(markers)]
+        tracks.append([MarkerTrack.of(detections.t_s[k], detections.xy[k]) for k in rows])
+    return tracks
+
+
+def interpolate(tracks: Sequence[MarkerTrack], label: Index, t_s: Array, gap_s: float) -> Array:
+    """Return positions (..., n, 2) of the markers `label` (n,) at timestamps (..., n); `tracks` are by marker."""
+    found = np.full((*t_s.shape, 2), np.nan)
+    for marker, track in enumerate(tracks):
+        mine = label == marker
+        found[..., mine, :] = track.interpolate(t_s[..., mine], gap_s)
+    return found
+
+
+def gather_background(
+    messages: Sequence[Detections], names: Sequence[str], lenses: Sequence[Camera], start_ns: int
+) -> WandDetections | None:
+    """Collect the images of background points as columns, with times in seconds after `start_ns`; the `id` of a
+    detection is the number of its point. Cameras that are not among `names` are left out; None without any image.
+
+    Raises:
+        CalibrationError: detections have no numbers.
+    """
+    mine = [m for m in messages if m.camera in set(names) and len(m)]
+    if not mine:
+        return None
+    first_ns = min(message.t_ns for message in mine)
+    detections = gather(mine, names, lenses)[1]
+    if (detections.label < 0).any():
+        raise CalibrationError(
+            "background points need numbers that are the same in all cameras: fill the column marker of their table"
+        )
+    return replace(detections, t_s=detections.t_s + (first_ns - start_ns) * 1e-9)
+
+
+@dataclass(frozen=True, slots=True)
+class WandRecording:
+    """A labeled recording of C cameras, numbered 0 to C - 1.
+
+    Attributes:
+        names, lenses: of its cameras, sorted by name.
+        wand: that was recorded.
+        frames: all frames.
+        timing: how the cameras' frames are related in time.
+        detections: the markers of the wand, at most one row per frame and marker.
+        tracks: of these by camera and marker, by stamps.
+        left_out: by camera, the number of frames without a marker by reason.
+        middle_s: stamp in the middle of the recording, at which time offsets are defined.
+        readout_s: (C,) given readout times, which the times of detections contain.
+        background: images of background points, if there are any.
+    """
+
+    names: list[str]
+    lenses: list[Lens]
+    wand: Body
+    frames: FrameTable
+    timing: Timing
+    detections: WandDetections
+    tracks: list[list[MarkerTrack]]
+    left_out: list[Counter[str]]
+    middle_s: float
+    readout_s: Array
+    background: WandDetections | None = None
+
+    def of_cameras(self, chosen: Sequence[int]) -> "WandRecording":
+        """The recording of some of the cameras, ascending, renumbered."""
+        number = np.full(len(self.names), -1)
+        number[chosen] = np.arange(len(chosen))
+        mine = number[self.frames.camera] >= 0
+        detections = _renumber(self.detections, number)
+        names, lenses, tracks, left_out = (
+            [column[k] for k in chosen] for column in (self.names, self.lenses, self.tracks, self.left_out)
+        )
+        return replace(
+            self,
+            names=names,
+            lenses=lenses,
+            frames=FrameTable(
+                number[self.frames.camera[mine]], self.frames.t_s[mine], self.frames.readout_s[mine]
+            ),
+            detections=replace(detections, frame=(np.cumsum(mine) - 1)[detections.frame]),
+            tracks=tracks,
+            left_out=left_out,
+            readout_s=self.readout_s[chosen],
+            background=None if self.background is None else _renumber(self.background, number),
+        )
+
+    def with_detections(self, detections: WandDetections) -> "WandRecording":
+        """The recording with other detections of the same cameras."""
+        tracks = build_tracks(detections, len(self.lenses), len(self.wand.markers))
+        return replace(self, detections=detections, tracks=tracks)
+
+    def select(self, rows: NDArray) -> "WandRecording":
+        """The recording with the detections that a mask or an index array selects."""
+        return self.with_detections(self.detections.select(rows))
+
+    def with_centres(self, rows: Index, uv: Array) -> "WandRecording":
+        """The recording with other centres (n, 2), raw pixels, of the detections `rows` (n,)."""
+        changed = self.detections.uv.copy()
+        changed[rows] = uv
+        xy = normalise(self.lenses, self.detections.camera, changed)
+        return self.with_detections(replace(self.detections, uv=changed, xy=xy))
+
+    def with_row_times(self, readout_s: Array) -> "WandRecording":
+        """The recording with stamps of rows for readout times (C,) that are longer by this."""
+        detections = self.detections
+        later = readout_s[detections.camera] * detections.image_row
+        return self.with_detections(replace(detections, t_s=detections.t_s + later))
+
+    def undistort_tracks(self, lenses: Sequence[Lens]) -> "WandRecording":
+        """The recording with its tracks undistorted by other lenses; `lenses` stay the given ones."""
+        tracks = [
+            [
+                MarkerTrack.of(
+                    track.t_s, new.normalise(old.project(np.column_stack([track.xy, np.ones(len(track.xy))])))
+                )
+                for track in mine
+            ]
+            for mine, old, new in zip(self.tracks, self.lenses, lenses, strict=True)
+        ]
+        return replace(self, tracks=tracks)
+
+
+def _renumber(detections: WandDetections, number: Index) -> WandDetections:
+    """The detections of the cameras whose `number` (C,) is not negative, under these."""
+    camera = number[detections.camera]
+    return replace(detections, camera=camera).select(camera >= 0)

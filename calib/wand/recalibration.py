@@ -10,19 +10,22 @@ import numpy as np
 from calib.errors import CalibrationError
 from calib.rig.camera import LENS, OFFSET, POSE
 from calib.rig.rig import Rig
-from calib.wand.adjustment import Solution
-from calib.wand.bundle_adjustment.clock_model import with_readout_times
-from calib.wand.bundle_adjustment.covariance import camera_covariance, inflate_covariance
+from calib.wand.bundle_adjustment.covariance import (
+    camera_covariance,
+    estimate_lens_priors,
+    inflate_covariance,
+)
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
-from calib.wand.bundle_adjustment.lens_prior import estimate_lens_priors
-from calib.wand.bundle_adjustment.optimizer import Adjusted, adjust, optimize_robustly
-from calib.wand.bundle_adjustment.problem import Estimate, WandObservations
-from calib.wand.bundle_adjustment.problem_setup import LabeledRecording, build_problem
-from calib.wand.calibrate import check_recording
-from calib.wand.conclusion import adjusted_camera, clock_values
-from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling.labels import WandRecording, label_recording
-from calib.wand.quality.checks import check_agreement, check_lenses
+from calib.wand.bundle_adjustment.optimizer import adjust, optimize_robustly
+from calib.wand.bundle_adjustment.problem import Adjusted, Estimate, WandObservations
+from calib.wand.bundle_adjustment.problem_setup import build_problem
+from calib.wand.calibrate import check_agreement, check_recording
+from calib.wand.clock_model import with_readout_times
+from calib.wand.conclusion import Solution, adjusted_camera, clock_values
+from calib.wand.detections import WandRecording
+from calib.wand.initial_rig import TwoViewGeometry
+from calib.wand.labels import label_recording
+from calib.wand.quality.checks import check_lenses
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
@@ -77,11 +80,10 @@ def recalibrate_camera(
     this = recording.names.index(name)
     pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.timing)
     cameras, offset_s = _initial_rig(rig, recording.names, pairs, this)
-    labeled = LabeledRecording.of(recording, pairs, list(range(len(recording.names))))
-    start = build_problem(labeled, cameras, offset_s, MAX_FRAME_SETS)
+    start = build_problem(recording, cameras, offset_s, MAX_FRAME_SETS)
     if start is None:
         raise CalibrationError("the wand's lengths do not fit the detections; check the wand file")
-    solution = _adjust(labeled, start, this)
+    solution = _adjust(recording, start, this)
     return _conclude(rig, name, this, solution)
 
 
@@ -125,7 +127,7 @@ def _initial_rig(rig: Rig, names: list[str], pairs: TwoViewGeometry, this: int) 
     )
 
 
-def _adjust(recording: LabeledRecording, start: Estimate, this: int) -> Solution:
+def _adjust(recording: WandRecording, start: Estimate, this: int) -> Solution:
     """Adjust the camera: robustly, with usual lens priors, and with estimated lens priors."""
     clock = () if recording.timing.synchronous else OFFSET
     problem = replace(start.problem.with_free(POSE, clock), estimated=(this,))

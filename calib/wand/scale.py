@@ -2,15 +2,11 @@
 """The measured distance of two cameras: the scale for a wand of one marker, a check of any other wand."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.rig.camera import POSE
-from calib.wand.bundle_adjustment.covariance import camera_covariance
-from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import gauge_directions
 
 SIGMA_M = 0.005  # of a tape measure between two lenses: the projection centres inside are not visible
 CLEAR = 3.0  # standard deviations, beyond which two lengths contradict each other
@@ -96,46 +92,3 @@ class DistanceComparison:
         if abs(self.difference_m) <= CLEAR * self.sigma_m:
             return text
         return f"warning: {text}; measure the wand, whose length gives the scale, and the distance again"
-
-
-def compare_distance(
-    distance: Distance, names: Sequence[str], adjusted: Adjusted
-) -> DistanceComparison | None:
-    """Compare a measured distance with the adjusted poses; None if one of the two cameras is not placed.
-
-    Args:
-        distance: the measured one.
-        names: of the adjusted cameras.
-        adjusted: the adjustment.
-    """
-    if distance.a not in names or distance.b not in names:
-        return None
-    ends = [names.index(distance.a), names.index(distance.b)]
-    first, second = adjusted.state.cameras[ends]
-    gap = first[:3, 3] - second[:3, 3]
-    length = float(np.linalg.norm(gap))
-    J = np.concatenate([gap @ first[:3, :3], -gap @ second[:3, :3]]) / length
-    cov = camera_covariance(adjusted).of(POSE)[np.ix_(ends, range(3, 6), ends, range(3, 6))].reshape(6, 6)
-    return DistanceComparison(distance, length, float(np.sqrt(J @ cov @ J + distance.sigma_m**2)))
-
-
-def add_scale_uncertainty(adjusted: Adjusted, distance: Distance) -> Adjusted:
-    """Add the uncertainty of the distance that gave the scale, which the adjustment took as exact.
-
-    The covariance S becomes S + s^2 g g', for the relative standard deviation s of the distance and the derivative g of
-    the cameras by the scale of the world, without its component along the gauge. In the information matrix this is a
-    downdate of rank one (Sherman and Morrison).
-    """
-    relative = distance.sigma_m / distance.metres / (adjusted.scale * adjusted.inflation**0.5)
-    if relative == 0:
-        return adjusted
-    free, cameras = adjusted.problem.free, adjusted.state.cameras
-    by_scale = np.zeros((len(cameras), len(free)))
-    translations = [free.index(p) for p in POSE[3:]]
-    by_scale[:, translations] = np.einsum("cji,cj->ci", cameras[:, :3, :3], cameras[:, :3, 3])
-    gauge = np.linalg.qr(gauge_directions(adjusted.state, free))[0]
-    g = by_scale.ravel() - gauge @ (gauge.T @ by_scale.ravel())
-    weighted = adjusted.information @ g
-    weighted -= gauge @ (gauge.T @ weighted)
-    lost = np.outer(weighted, weighted) / (relative**-2 + g @ weighted)
-    return replace(adjusted, information=adjusted.information - lost)

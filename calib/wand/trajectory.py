@@ -10,52 +10,10 @@ docs/design/wand_adjustment.md has the equations.
 """
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from camera_node.geometry.body import Body
-
-COPLANAR = 0.01  # of the wand's extent: markers nearer to the basis's span than this add no basis marker
-
-
-@dataclass(frozen=True, slots=True)
-class AffineWand:
-    """Markers as combinations of basis markers.
-
-    Attributes:
-        basis: (B,) indices of the basis markers: 1, 2 on a line, 3 in a plane or 4.
-        weights: (M, B) rows that sum to 1; marker k = weights[k] @ basis points.
-        pairs: (E, 2) pairs of basis markers, as indices into `basis`.
-        lengths: (E,) their distances, metres.
-    """
-
-    basis: Index
-    weights: Array
-    pairs: Index
-    lengths: Array
-
-    @classmethod
-    def of(cls, wand: Body) -> "AffineWand":
-        """Choose the basis greedily: each next marker is the farthest from the span of the previous ones."""
-        points = wand.points
-        extent = np.ptp(points, axis=0).max()
-        basis = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
-        while len(basis) < min(4, len(points)):
-            off = (points - points[basis[0]]).T
-            if len(basis) > 1:
-                span = np.linalg.qr((points[basis[1:]] - points[basis[0]]).T)[0]
-                off = off - span @ (span.T @ off)
-            if (distance := np.linalg.norm(off, axis=0)).max() < COPLANAR * extent:
-                break
-            basis.append(int(distance.argmax()))
-        system = np.vstack([points[basis].T, np.ones(len(basis))])
-        weights = np.linalg.lstsq(system, np.vstack([points.T, np.ones(len(points))]), rcond=None)[0].T
-        pairs = np.array(list(combinations(range(len(basis)), 2)), np.intp).reshape(-1, 2)
-        ends = points[basis][pairs]
-        lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-        return cls(np.array(basis), np.asarray(weights, float), pairs, lengths)
 
 
 def hermite(tau: Array, dt: Array) -> Array:

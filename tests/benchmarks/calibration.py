@@ -23,7 +23,7 @@ from rich.table import Table
 
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from tests.benchmarks.calibration_data import run as run_data

@@ -30,7 +30,7 @@ from calib.errors import CalibrationError
 from calib.rig.camera import Camera, with_distortion
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, rotation_from_vector

@@ -36,7 +36,7 @@ from calib.rig.camera import OFFSET, POSE
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.terminal import track
 from camera_node.geometry.body import Body

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from calib.wand.calibrate import calibrate
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.terminal import track
 from camera_node.geometry.body import Body

@@ -10,7 +10,7 @@ import numpy as np
 from calib.rig.camera import Camera, transform
 from calib.rig.rig import Rig
 from calib.wand.quality.agreement import CameraPoses, compare_calibrations
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body, thickness_of

@@ -1,26 +1,51 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The covariance of adjusted cameras: from measurement noise, from priors, and for residuals correlated in time.
+"""The covariance of adjusted cameras, and the priors of their lenses, which the same information gives.
 
 A lens model that does not fit exactly causes residuals that are alike while the wand is near the same place, for about
 a second; a covariance that takes every frame as independent is then too small. The cluster-robust (sandwich) covariance
 corrects that (Liang and Zeger 1986; Cameron and Miller 2015): with the scores s_b, summed over blocks of time, and the
 information H, it is H^-1 (sum_b s_b s_b^T) H^-1, and equals H^-1 where residuals are independent. A minute has too few
 blocks for every entry, but enough for one factor: the mean of its eigenvalues over those of H^-1.
-docs/design/wand_adjustment.md has the equations.
+
+The prior of a lens is its own calibration's standard deviations, or an estimate from the wand recording: a lens file
+without standard deviations may come from a data sheet or from a careful calibration. The recording corrects many lenses
+and so estimates how far off they are (empirical Bayes: Efron and Morris 1973): the deviation that lenses share, by kind
+of parameter, has a marginal likelihood. In the estimate, its prior is a mixture (spike and slab; Mitchell and Beauchamp
+1988): exact with probability 1/2, else of any order of magnitude, so exact lenses lose no accuracy. For the covariance,
+its prior is uniform between zero and the usual deviation (Gelman 2006), so errors that the recording cannot show count
+in full. docs/design/wand_adjustment.md has the equations.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
-from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import Problem
-from calib.wand.bundle_adjustment.schur_complement import invert_information
-from camera_node.foundation.arrays import Array, Index
+from calib.rig.camera import LENS, Camera, stated_sigma, with_distortion
+from calib.wand.bundle_adjustment.problem import Adjusted, Problem, invert_information
+from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.geometry.lens import Lens
 
 BLOCK_S = 1.0  # longer than the wand stays in one place
 BLOCKS = 10  # of frame sets in order, where these may be any time apart
 MIN_BLOCKS = 4  # fewer do not show a correlation
+# Usual standard deviations of the parameters of a lens whose file has none, between a data sheet, or a careless
+# calibration, and the true lens: log f, the principal point (share of the longer side), k1, log fx / fy, and the
+# distortion coefficients after k1.
+FOCAL, CENTRE, K1, RATIO, HIGHER = 0.03, 0.02, 0.1, 0.01, (0.1, 0.005, 0.005, 0.1)
+# Factors of these for a lens that the recording shows to be farther off: a file of another lens, or none.
+WIDER = np.array([15.0, 4.0, 4.0, 5.0, 4.0, 4.0, 2.0, 2.0, 4.0])
+CONTRADICTED = 1e-4  # probability below which the recording contradicts standard deviations of a lens
+UNCOMMON = 0.1  # part of the errors of fx and fy that is not common to both
+# Deviations that lenses may share, as shares of the usual ones, and their prior probabilities: for the estimate and for
+# the covariance.
+SHARES = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 31)])
+SPIKE_AND_SLAB, UNIFORM = np.where(SHARES > 0, 0.5 / (len(SHARES) - 1), 0.5), SHARES / SHARES.sum()
+MIN_SHARE = 1e-5  # of the usual deviations: practically exact
+# Of the parameters: focal length, principal point, k1 and k2, ratio, p1 and p2, k3 (of a fisheye: k3 and k4, none).
+KINDS = np.array([0, 1, 1, 2, 3, 2, 4, 4, 5])
+SWEEPS = 4  # over the kinds, each conditional on the others
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,3 +141,137 @@ def _first_intervals(problem: Problem) -> Index:
     knot_s = problem.knot_s[:-1]
     by_count, by_time = np.arange(len(knot_s)) * BLOCKS // len(knot_s), (knot_s - knot_s[0]) // BLOCK_S
     return np.flatnonzero(np.diff(by_count if problem.gap_s == 0 else by_time, prepend=-1))
+
+
+def usual_sigma(lens: Lens) -> Array:
+    """(9,) usual standard deviations of the parameters (`LENS`) of a lens whose file has none."""
+    size = max(lens.width, lens.height)
+    return np.array([FOCAL, CENTRE * size, CENTRE * size, K1, RATIO, *HIGHER])
+
+
+def calibrated_sigma(lens: Lens) -> Array | None:
+    """(9,) standard deviations of the parameters (`LENS`) from the lens's file; None where it has none.
+
+    The file does not state how fx and fy are correlated. They are nearly equal in relative terms, so the part of their
+    errors that is not common, and changes fx / fy, counts as a tenth. Deviations of 0 declare a lens exact, and
+    coefficients after k1 without one count as exact.
+    """
+    if not isinstance(lens, Camera) or lens.lens_sigma is None:
+        return None
+    fx, fy, cx, cy, *distortion = lens.lens_sigma
+    focal = np.hypot(fx / lens.fx, fy / lens.fy) / np.sqrt(2)
+    k1, *higher = distortion or [K1]
+    higher = [*higher, 0.0, 0.0, 0.0, 0.0][:4]
+    return np.maximum([focal, cx, cy, k1, UNCOMMON * focal, *higher], MIN_SHARE * usual_sigma(lens))
+
+
+def coarse_sigma(lens: Lens) -> Array:
+    """(9,) prior standard deviations before the recording decides: the usual ones, or larger ones of the file."""
+    given = calibrated_sigma(lens)
+    return usual_sigma(lens) if given is None else np.maximum(usual_sigma(lens), given)
+
+
+def widen_lenses(cameras: Mapping[str, Camera], factor: float) -> dict[str, Camera]:
+    """The cameras with the standard deviations of all lenses multiplied by `factor`; a lens whose file has none gets
+    the usual ones, multiplied."""
+    widened = {}
+    for name, given in cameras.items():
+        camera = with_distortion(given)
+        sigma = camera.lens_sigma or parameter_sigma(camera, None, usual_sigma(camera))
+        widened[name] = msgspec.structs.replace(camera, lens_sigma=tuple(factor * value for value in sigma))
+    return widened
+
+
+def parameter_sigma(lens: Lens, before: tuple[float, ...] | None, sigma: Array) -> tuple[float, ...]:
+    """`Camera.lens_sigma` of an adjusted lens.
+
+    Args:
+        lens: the adjusted lens.
+        before: `lens_sigma` of its file, which stays for parameters that are not adjusted; these count as exact
+            without it.
+        sigma: (9,) standard deviations of the adjusted parameters (`LENS`).
+    """
+    focal, cx, cy, k1, ratio, *higher = sigma.tolist()
+    focal = float(np.hypot(focal, ratio / 2))
+    count = len(lens.parameters)
+    rest = (*(before or ()), *[0.0] * count)[9:count]
+    return stated_sigma(lens, (focal * lens.fx, focal * lens.fy, cx, cy, k1, *higher, *rest)[:count])
+
+
+def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:
+    """The problem with lens priors from an adjustment of the same recording.
+
+    Standard deviations from a lens's file hold unless the recording contradicts them. For all other lenses the
+    recording gives a deviation by kind of parameter. Fixed cameras keep their priors.
+
+    Args:
+        problem: to change.
+        adjusted: an adjustment of the recording with any lens priors.
+    """
+    estimated = list(adjusted.problem.estimated_cameras())
+    information, gradient = _lens_likelihood(adjusted)
+    sigma, unknown = _choose_sigma(adjusted.problem, information, gradient)
+    prior, wider = problem.lens_sigma.copy(), problem.lens_sigma.copy()
+    prior[estimated] = sigma * estimate_shares(information, gradient, sigma, unknown, SPIKE_AND_SLAB)
+    uniform = sigma * estimate_shares(information, gradient, sigma, unknown, UNIFORM)
+    wider[estimated] = np.maximum(uniform, prior[estimated])
+    return replace(problem, lens_sigma=prior, covariance_lens_sigma=wider)
+
+
+def _lens_likelihood(adjusted: Adjusted) -> tuple[Array, Array]:
+    """(9S, 9S) information of the observations alone on the S estimated lenses, and (9S,) its product with their
+    maximum-likelihood estimate."""
+    problem = adjusted.problem
+    estimated, d = list(problem.estimated_cameras()), len(problem.free)
+    rows = np.ravel(np.arange(len(estimated))[:, None] * d + [problem.free.index(p) for p in LENS])
+    variance = adjusted.scale**2 * adjusted.inflation
+    with_prior = np.linalg.inv(inverse_information(adjusted)[np.ix_(rows, rows)])
+    prior = np.diag(problem.lens_sigma[estimated].ravel() ** -2)
+    return (with_prior - prior) / variance, with_prior @ adjusted.state.lenses[estimated].ravel() / variance
+
+
+def _choose_sigma(problem: Problem, information: Array, gradient: Array) -> tuple[Array, Mask]:
+    """(S, 9) standard deviations of the estimated lenses: from their files where the recording does not contradict
+    them, else the usual ones, or wider ones where it contradicts these too; and which (S, 9) are the usual ones, of
+    `unknown` size."""
+    lenses, size = [problem.lenses[k] for k in problem.estimated_cameras()], len(KINDS)
+    sigma, unknown = np.array([usual_sigma(lens) for lens in lenses]), np.ones((len(lenses), size), bool)
+    # With wider priors, a recording that does not determine a lens would contradict any: the equations are linear only
+    # near the adjustment.
+    covariance = np.asarray(np.linalg.inv(information + np.diag(sigma.ravel() ** -2)), float)
+    correction = (covariance @ gradient).reshape(-1, size)
+    for k, lens in enumerate(lenses):
+        block, given = covariance[size * k :, size * k :][:size, :size], calibrated_sigma(lens)
+        if given is not None and _plausible(correction[k], block + np.diag(given**2)):
+            sigma[k], unknown[k] = given, False
+        elif not _plausible(correction[k], block + np.diag(sigma[k] ** 2)):
+            sigma[k], unknown[k] = WIDER * sigma[k], False
+    return sigma, unknown
+
+
+def _plausible(correction: Array, covariance: Array) -> bool:
+    from scipy.special import chdtrc
+
+    squared = correction @ np.linalg.solve(covariance, correction)
+    return bool(chdtrc(len(correction), squared) > CONTRADICTED)
+
+
+def estimate_shares(information: Array, gradient: Array, sigma: Array, unknown: Mask, prior: Array) -> Array:
+    """(S, 9) share of `sigma` that lenses of `unknown` deviation are off by, the same for all parameters of a kind: the
+    root of the posterior mean of its square under `prior`, one kind after the other; 1 for other lenses."""
+    shares = np.ones(len(KINDS))
+    for kind in np.tile(np.unique(KINDS), SWEEPS if unknown.any() else 0):
+        tried = np.where(kind == KINDS, SHARES[:, None], shares)
+        trials = np.where(unknown, tried[:, None], 1.0) * sigma
+        likelihood = _log_marginals(information, gradient, trials.reshape(len(SHARES), -1))
+        weight = prior * np.exp(likelihood - likelihood.max())
+        shares[kind == KINDS] = max(np.sqrt(weight @ SHARES**2 / weight.sum()), MIN_SHARE)
+    return np.where(unknown, shares, 1.0)
+
+
+def _log_marginals(information: Array, gradient: Array, sigma: Array) -> Array:
+    """(t,) log marginal likelihoods of deviations `sigma` (t, n), with information L and gradient g, parameters
+    integrated out: with S = diag(sigma), g^T S (1 + S L S)^-1 S g / 2 - log det(1 + S L S) / 2."""
+    root = np.linalg.cholesky(np.eye(len(gradient)) + sigma[:, :, None] * information * sigma[:, None])
+    whitened = np.linalg.solve(root, (sigma * gradient)[:, :, None])[:, :, 0]
+    return np.asarray((whitened**2).sum(axis=1) / 2 - np.log(np.einsum("tnn->tn", root)).sum(axis=1), float)

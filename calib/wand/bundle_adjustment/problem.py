@@ -2,15 +2,15 @@
 """The data of the wand's bundle adjustment: observations, unknowns (`State`) and constants (`Problem`)."""
 
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import LENS, PER_CAMERA, POSE, with_distortion
-from calib.wand.background import BackgroundPoints
-from calib.wand.trajectory import AffineWand
 from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import adjoint, invert, rotation_from_vector
 
@@ -19,6 +19,7 @@ POSE_SIGMA, OFFSET_SIGMA = [np.inf] * 6, [0.5]
 READOUT_SIGMA = 0.02  # of the readout time, beside what is given, s: rolling shutters take 5 to 40 ms
 # And of the clock's drift, s/s: of a clock that a time service slews, and of a free-running crystal (50 ppm at most).
 SLEWED_DRIFT, CRYSTAL_DRIFT = 5e-4, 3e-5
+COPLANAR = 0.01  # of the wand's extent: markers nearer to the basis's span than this add no basis marker
 SHAKE_ITERATIONS = 4  # that satisfy several lengths together
 
 
@@ -67,6 +68,75 @@ class TimedRows(Protocol):
     def t_s(self) -> Array: ...
     @property
     def image_row(self) -> Array: ...
+
+
+@dataclass(frozen=True, slots=True)
+class AffineWand:
+    """Markers as combinations of basis markers.
+
+    Attributes:
+        basis: (B,) indices of the basis markers: 1, 2 on a line, 3 in a plane or 4.
+        weights: (M, B) rows that sum to 1; marker k = weights[k] @ basis points.
+        pairs: (E, 2) pairs of basis markers, as indices into `basis`.
+        lengths: (E,) their distances, metres.
+    """
+
+    basis: Index
+    weights: Array
+    pairs: Index
+    lengths: Array
+
+    @classmethod
+    def of(cls, wand: Body) -> "AffineWand":
+        """Choose the basis greedily: each next marker is the farthest from the span of the previous ones."""
+        points = wand.points
+        extent = np.ptp(points, axis=0).max()
+        basis = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
+        while len(basis) < min(4, len(points)):
+            off = (points - points[basis[0]]).T
+            if len(basis) > 1:
+                span = np.linalg.qr((points[basis[1:]] - points[basis[0]]).T)[0]
+                off = off - span @ (span.T @ off)
+            if (distance := np.linalg.norm(off, axis=0)).max() < COPLANAR * extent:
+                break
+            basis.append(int(distance.argmax()))
+        system = np.vstack([points[basis].T, np.ones(len(basis))])
+        weights = np.linalg.lstsq(system, np.vstack([points.T, np.ones(len(points))]), rcond=None)[0].T
+        pairs = np.array(list(combinations(range(len(basis)), 2)), np.intp).reshape(-1, 2)
+        ends = points[basis][pairs]
+        lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+        return cls(np.array(basis), np.asarray(weights, float), pairs, lengths)
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundPoints:
+    """Images of J points at unknown positions, at most one a camera and point, sorted by point, then by camera.
+
+    Attributes:
+        point, camera: (n,) numbers, from 0.
+        uv: (n, 2) raw pixels.
+        cov: (n, 2, 2) their covariance, square pixels.
+    """
+
+    point: Index
+    camera: Index
+    uv: Array
+    cov: Array
+
+    def __len__(self) -> int:
+        """The number of points."""
+        return int(self.point[-1]) + 1 if len(self.point) else 0
+
+    @classmethod
+    def none(cls) -> "BackgroundPoints":
+        """No points."""
+        nothing = np.zeros(0, np.intp)
+        return cls(nothing, nothing, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+
+    def select(self, rows: NDArray) -> "BackgroundPoints":
+        """The rows (n,) that a mask selects, with the points renumbered."""
+        point = np.unique(self.point[rows], return_inverse=True)[1]
+        return BackgroundPoints(point, self.camera[rows], self.uv[rows], self.cov[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +314,36 @@ class Estimate:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Adjusted:
+    """The optimal state, and what its covariance follows from (`covariance`).
+
+    Attributes:
+        problem: that was optimized.
+        state: cameras, clocks, lenses and motion.
+        used: (n,) observations that were not rejected.
+        residuals: (n, 2) observed minus predicted pixels, of all observations.
+        scale: ratio of the residuals to their assumed standard deviations, the square root of the variance factor.
+        information: (S d, S d) of the S estimated cameras' free parameters at the assumed noise, with priors. Its null
+            space is the gauge: the choice of the world, and of the time that clocks are relative to.
+        scores: (L + J, S d) gradients by interval between knots, then by background point, without priors.
+        iterations: of all rounds.
+        background_used: images of background points that were not rejected.
+        inflation: factor of the covariance for residuals that are correlated in time.
+    """
+
+    problem: Problem
+    state: State
+    used: Mask
+    residuals: Array
+    scale: float
+    information: Array
+    scores: Array
+    iterations: int
+    background_used: Mask
+    inflation: float = 1.0
+
+
 def gauge_directions(state: State, free: tuple[int, ...]) -> Array:
     """(C d, g) changes of the free camera parameters that no observation depends on: rotation and translation of the
     world, and offset and drift that all clocks share."""
@@ -253,3 +353,12 @@ def gauge_directions(state: State, free: tuple[int, ...]) -> Array:
         rows[6, 6] = rows[7, 7] = 1.0
     present = [g for g in range(8) if g < 6 or g in free]
     return columns[:, free][:, :, present].reshape(-1, len(present))
+
+
+def invert_information(problem: Problem, state: State, information: Array) -> Array:
+    """(S d, S d) pseudo-inverse of the information on the estimated cameras, without the gauge."""
+    if problem.estimated is not None:
+        return np.asarray(np.linalg.inv(information), float)
+    gauge = gauge_directions(state, problem.free)
+    rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
+    return np.asarray(rest @ np.linalg.inv(rest.T @ information @ rest) @ rest.T, float)

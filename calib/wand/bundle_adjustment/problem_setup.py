@@ -1,122 +1,52 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Builds the bundle adjustment of a labeled recording: its frame sets, the initial motion, and the observations."""
+"""Builds the bundle adjustment of a labeled recording: its frame sets, the initial motion, and the observations.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+Frames of different cameras are grouped into frame sets, of which the adjustment uses those that cover the images. The
+wand's position at each is triangulated from a rough rig. Points beside the wand, at unknown positions, that several
+cameras see ("unpaired" or background points of easyWand and Argus) are matched in time: they may stand still or move,
+and constrain the cameras where the wand is not waved.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from calib.wand.background import match_points
-from calib.wand.bundle_adjustment.eliminated_points import start_points
-from calib.wand.bundle_adjustment.frame_sets import choose_frame_sets, group_frames
-from calib.wand.bundle_adjustment.initial_motion import initial_positions
-from calib.wand.bundle_adjustment.lens_prior import coarse_sigma
-from calib.wand.bundle_adjustment.problem import Estimate, Problem, State, WandObservations
-from calib.wand.detections import WandDetections, normalise
-from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling.labels import WandRecording
-from calib.wand.timing import Timing
-from calib.wand.tracks import MarkerTrack, build_tracks
-from calib.wand.trajectory import AffineWand, acceleration_density, finite_velocities
+from calib.rig.triangulation import intersect
+from calib.wand.bundle_adjustment.covariance import coarse_sigma
+from calib.wand.bundle_adjustment.problem import (
+    AffineWand,
+    BackgroundPoints,
+    Estimate,
+    Problem,
+    State,
+    WandObservations,
+)
+from calib.wand.bundle_adjustment.residuals import start_points
+from calib.wand.detections import (
+    SAME_S,
+    MarkerTrack,
+    WandDetections,
+    WandRecording,
+)
+from calib.wand.trajectory import acceleration_density, finite_velocities
 from camera_node.foundation.arrays import Array, Index, Mask
-from camera_node.geometry.body import Body
-from camera_node.geometry.lens import Lens
 
 MIN_SIGMA_PX = 0.02  # error of every lens model, in addition to the covariance of the detector
 MIN_KNOTS = 2
+WINDOW = 8  # consecutive frame sets that are chosen together, so that the motion between them is estimated
+CELLS = (4, 3)  # columns and rows of an image, for coverage
+AGREE = 4.0  # times the median of these angles: a ray within agrees with the point
+LENGTH_TOLERANCE = 0.25  # of a wand length: beyond, a detection is wrong
+SPIKE = 5.0  # of the median deviation from the neighbours' straight line
+MIN_AGREEING = 3  # rays that make a position reliable
+STILL = 3.0  # standard deviations of one detection: the images of a point that stands still differ by less
+# Part of the error of a detection that is the same in all images of a point that stands still.
+STILL_SIGMA_PX = 0.05
+MAX_POINTS = 2000  # positions of points that are used
 
 
-@dataclass(frozen=True, slots=True)
-class LabeledRecording:
-    """The labeled detections of C placed cameras, numbered 0 to C - 1.
-
-    Attributes:
-        detections: of these cameras.
-        names, lenses: of the cameras.
-        tracks: by camera and marker, by stamps.
-        wand: that was recorded.
-        timing: how their frames are related in time.
-        middle_s: stamp in the middle of the recording, at which time offsets are defined.
-        readout_s: (C,) given readout times, which the times of detections contain.
-        background: images of background points in these cameras, if there are any.
-    """
-
-    detections: WandDetections
-    names: Sequence[str]
-    lenses: Sequence[Lens]
-    tracks: Sequence[Sequence[MarkerTrack]]
-    wand: Body
-    timing: Timing
-    middle_s: float
-    readout_s: Array
-    background: WandDetections | None = None
-
-    @classmethod
-    def of(
-        cls, recording: WandRecording, pairs: TwoViewGeometry, placed: Sequence[int]
-    ) -> "LabeledRecording":
-        """The cameras `placed` of a recording, renumbered in this order."""
-        number = np.full(len(recording.names), -1)
-        number[placed] = np.arange(len(placed))
-        detections = _renumber(recording.detections, number)
-        t_s, given_s = recording.frames.t_s, recording.frames.readout_s
-        last = np.searchsorted(recording.frames.camera, placed, side="right") - 1
-        return cls(
-            detections,
-            [recording.names[k] for k in placed],
-            [recording.lenses[k] for k in placed],
-            [pairs.tracks[k] for k in placed],
-            pairs.wand,
-            recording.timing,
-            float(t_s.min() + t_s.max()) / 2,
-            given_s[last],
-            None if recording.background is None else _renumber(recording.background, number),
-        )
-
-    def with_centres(self, rows: Index, uv: Array) -> "LabeledRecording":
-        """The recording with other centres (n, 2), raw pixels, of the detections `rows` (n,)."""
-        changed = self.detections.uv.copy()
-        changed[rows] = uv
-        xy = normalise(self.lenses, self.detections.camera, changed)
-        return self._with(replace(self.detections, uv=changed, xy=xy))
-
-    def with_row_times(self, readout_s: Array) -> "LabeledRecording":
-        """The recording with stamps of rows for readout times (C,) that are longer by this."""
-        detections = self.detections
-        later = readout_s[detections.camera] * detections.image_row
-        return self._with(replace(detections, t_s=detections.t_s + later))
-
-    def select(self, rows: Mask) -> "LabeledRecording":
-        """The recording with some of its detections (n,) only."""
-        return self._with(self.detections.select(rows))
-
-    def _with(self, detections: WandDetections) -> "LabeledRecording":
-        tracks = build_tracks(detections, len(self.lenses), len(self.wand.markers))
-        return replace(self, detections=detections, tracks=tracks)
-
-    def undistort_tracks(self, lenses: Sequence[Lens]) -> "LabeledRecording":
-        """The recording with its tracks undistorted by other lenses; `lenses` stay the given ones."""
-        tracks = [
-            [
-                MarkerTrack.of(
-                    track.t_s, new.normalise(old.project(np.column_stack([track.xy, np.ones(len(track.xy))])))
-                )
-                for track in mine
-            ]
-            for mine, old, new in zip(self.tracks, self.lenses, lenses, strict=True)
-        ]
-        return replace(self, tracks=tracks)
-
-
-def _renumber(detections: WandDetections, number: Index) -> WandDetections:
-    """The detections of the cameras whose `number` (C,) is not negative, under these."""
-    camera = number[detections.camera]
-    return replace(detections, camera=camera).select(camera >= 0)
-
-
-def build_problem(
-    recording: LabeledRecording, cameras: Array, offset_s: Array, budget: int
-) -> Estimate | None:
+def build_problem(recording: WandRecording, cameras: Array, offset_s: Array, budget: int) -> Estimate | None:
     """Build the problem around a rig that is nearly right.
 
     Args:
@@ -153,7 +83,7 @@ def build_problem(
     return Estimate(problem, State.of(cameras, offset_s, motion), _observations(recording, rows, knot))
 
 
-def add_background(recording: LabeledRecording, estimate: Estimate) -> Estimate:
+def add_background(recording: WandRecording, estimate: Estimate) -> Estimate:
     """The estimate with the recording's background points, matched and located by its cameras and clocks."""
     if (images := recording.background) is None:
         return estimate
@@ -163,9 +93,7 @@ def add_background(recording: LabeledRecording, estimate: Estimate) -> Estimate:
     return replace(estimate, problem=problem, state=state)
 
 
-def _choose_detections(
-    recording: LabeledRecording, offset_s: Array, budget: int
-) -> tuple[Index, Index, Array]:
+def _choose_detections(recording: WandRecording, offset_s: Array, budget: int) -> tuple[Index, Index, Array]:
     """The n detections of the chosen frame sets, (n,) their knots, and (K,) the knots' times."""
     detections = recording.detections
     true_s = detections.t_s + offset_s[detections.camera]
@@ -179,7 +107,7 @@ def _choose_detections(
     return rows, knot, _middle_times(true_s[rows], knot)
 
 
-def _frame_sets(recording: LabeledRecording, true_s: Array, order: Index) -> Index:
+def _frame_sets(recording: WandRecording, true_s: Array, order: Index) -> Index:
     """(n,) the frame set of every detection, -1 where only one camera has a frame."""
     detections = recording.detections
     frames, first, back = np.unique(detections.frame[order], return_index=True, return_inverse=True)
@@ -200,7 +128,7 @@ def _middle_times(t_s: Array, knot: Index) -> Array:
     return (low + high) / 2
 
 
-def _observations(recording: LabeledRecording, rows: Index, knot: Index) -> WandObservations:
+def _observations(recording: WandRecording, rows: Index, knot: Index) -> WandObservations:
     detections = recording.detections.select(rows)
     return WandObservations(
         row=rows,
@@ -215,3 +143,232 @@ def _observations(recording: LabeledRecording, rows: Index, knot: Index) -> Wand
         axes_px=detections.axes_px,
         angle_rad=detections.angle_rad,
     )
+
+
+def group_frames(t_s: Array, camera: Index, spread_s: float) -> Index:
+    """The frame set of each of F frames, (F,); -1 where only one camera has a frame.
+
+    A frame set is a run of frames within `spread_s`.
+
+    Args:
+        t_s: (F,) true capture times, ascending.
+        camera: (F,) camera of each frame.
+        spread_s: longest time between the frames of a set; 0 where only equal times are simultaneous.
+    """
+    sets, first, current = np.empty(len(t_s), np.intp), -np.inf, -1
+    for k, t in enumerate(t_s.tolist()):
+        if t - first > spread_s + SAME_S:
+            first, current = t, current + 1
+        sets[k] = current
+    pairs = np.unique(np.column_stack([sets, camera]), axis=0)
+    several = np.bincount(pairs[:, 0], minlength=1) >= 2
+    return np.where(several, np.cumsum(several) - 1, -1)[sets]
+
+
+def choose_frame_sets(detections: WandDetections, frame_set: Index, sizes: Array, budget: int) -> Mask:
+    """Which of K frame sets to use, at most about `budget`: all, or windows of them that cover all images evenly.
+
+    Greedy: each next window is the one with most detections in cells that have few so far.
+
+    Args:
+        detections: n detections in frame sets.
+        frame_set: (n,) their frame set.
+        sizes: (C, 2) width and height of the cameras' images.
+        budget: number of frame sets.
+    """
+    count = int(frame_set.max(initial=-1)) + 1
+    if count <= budget:
+        return np.ones(count, bool)
+    position = np.clip(detections.uv / sizes[detections.camera], 0, 0.999)
+    column, row = (position * CELLS).astype(np.intp).T
+    cell = (detections.camera * CELLS[0] + column) * CELLS[1] + row
+    counts = np.zeros((-(-count // WINDOW), len(sizes) * CELLS[0] * CELLS[1]))
+    np.add.at(counts, (frame_set // WINDOW, cell), 1.0)
+    total, chosen, available = np.zeros(counts.shape[1]), np.zeros(count, bool), np.ones(len(counts), bool)
+    for _ in range(budget // WINDOW):
+        gain = np.where(available, counts @ (1 / (1 + total)), -1.0)
+        best = int(gain.argmax())
+        available[best] = False
+        total += counts[best]
+        chosen[best * WINDOW : (best + 1) * WINDOW] = True
+    return chosen
+
+
+def initial_positions(
+    tracks: Sequence[Sequence[MarkerTrack]],
+    wand: AffineWand,
+    cameras: Array,
+    offset_s: Array,
+    knot_s: Array,
+    gap_s: float,
+) -> Array:
+    """(K, B, 3) positions of the wand's basis markers at the knots, world; NaN where unknown.
+
+    Args:
+        tracks: by camera and marker, by stamps.
+        wand: in affine coordinates.
+        cameras: (C, 4, 4) T_world_cam.
+        offset_s: (C,) true time = stamp + offset.
+        knot_s: (K,) ascending.
+        gap_s: longest time over which positions are interpolated.
+    """
+    markers, agreeing = triangulate(tracks, cameras, offset_s, knot_s, gap_s)
+    reliable = np.asarray((np.isnan(markers[:, :, 0]) | (agreeing >= MIN_AGREEING)).all(axis=1))
+    basis = solve_basis(markers, wand)
+    basis = remove_spikes(knot_s, basis, reliable, gap_s)
+    return interpolate_missing(knot_s, basis, gap_s)
+
+
+def solve_basis(markers: Array, wand: AffineWand) -> Array:
+    """Positions of the basis markers (K, B, 3) from those of all markers (K, M, 3), by least squares; NaN where the
+    lengths are wrong or too few markers are known."""
+    basis = np.full((len(markers), len(wand.basis), 3), np.nan)
+    known = np.isfinite(markers).all(axis=2)
+    for pattern in np.unique(known, axis=0):
+        if np.linalg.matrix_rank(wand.weights[pattern], tol=1e-6) == len(wand.basis):
+            rows = (known == pattern).all(axis=1)
+            basis[rows] = np.linalg.pinv(wand.weights[pattern]) @ markers[rows][:, pattern]
+    ends = basis[:, wand.pairs]
+    lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
+    basis[(np.abs(lengths - wand.lengths) > LENGTH_TOLERANCE * wand.lengths).any(axis=1)] = np.nan
+    return basis
+
+
+def remove_spikes(knot_s: Array, basis: Array, reliable: Mask, gap_s: float) -> Array:
+    """The positions (K, B, 3) with NaN at spikes: knots that are not `reliable` (K,) and deviate from the straight line
+    between their neighbours by much more than usual, and by no less than these do."""
+    if len(knot_s) < 3:
+        return basis
+    share = ((knot_s[1:-1] - knot_s[:-2]) / (knot_s[2:] - knot_s[:-2]))[:, None, None]
+    off = np.linalg.norm(basis[1:-1] - (1 - share) * basis[:-2] - share * basis[2:], axis=2).max(axis=1)
+    off = np.where(np.diff(knot_s)[1:] + np.diff(knot_s)[:-1] <= 2 * gap_s, np.nan_to_num(off), 0.0)
+    usual = np.median(off[off > 0]) if (off > 0).any() else np.inf
+    beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
+    spikes = 1 + np.flatnonzero((off > SPIKE * usual) & (off >= beside))
+    basis = basis.copy()
+    basis[spikes[~reliable[spikes]]] = np.nan
+    return basis
+
+
+def interpolate_missing(knot_s: Array, basis: Array, gap_s: float) -> Array:
+    """The positions (K, B, 3) with missing ones interpolated linearly between neighbours at most `gap_s` apart."""
+    known = np.flatnonzero(np.isfinite(basis).all(axis=(1, 2)))
+    if len(known) < 2:
+        return basis
+    after = np.clip(np.searchsorted(knot_s[known], knot_s), 1, len(known) - 1)
+    a, b = known[after - 1], known[after]
+    share = ((knot_s - knot_s[a]) / (knot_s[b] - knot_s[a]))[:, None, None]
+    near = (knot_s[b] - knot_s[a] <= gap_s)[:, None, None] & (share >= 0) & (share <= 1)
+    between = np.where(near, (1 - share) * basis[a] + share * basis[b], np.nan)
+    return np.where(np.isfinite(basis), basis, between)
+
+
+def triangulate(
+    tracks: Sequence[Sequence[MarkerTrack]], poses: Array, offset_s: Array, t_s: Array, gap_s: float
+) -> tuple[Array, Index]:
+    """Locate the markers at given times, robustly.
+
+    Minimises the distances to all viewing rays, reweighted by a Cauchy kernel.
+
+    Args:
+        tracks: by camera and marker, by timestamps.
+        poses: (C, 4, 4) T_world_cam.
+        offset_s: (C,) true time = timestamp + offset.
+        t_s: (K,) true times.
+        gap_s: the longest gap over which tracks are interpolated.
+
+    Returns:
+        points: (K, M, 3) markers, world; NaN if fewer than two cameras saw the marker near that time, or their rays
+            are nearly parallel.
+        agreeing: (K, M) number of rays that agree with the point.
+    """
+    xy = np.array(
+        [
+            [track.interpolate(t_s - offset, gap_s) for track in markers]
+            for markers, offset in zip(tracks, offset_s, strict=True)
+        ]
+    )  # (C, M, K, 2)
+    known = np.isfinite(xy[..., 0])
+    ray = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:3], 1))], axis=3)
+    ray = np.einsum("cij,cmkj->cmki", poses[:, :3, :3], ray / np.linalg.norm(ray, axis=3, keepdims=True))
+    points, angle = intersect(ray, poses[:, :3, 3], known)
+    usual = float(np.median(angle[known])) if known.any() else 0.0
+    agreeing = (known & (angle <= AGREE * usual)).sum(axis=0)
+    return np.swapaxes(points, 0, 1), agreeing.T
+
+
+def match_points(detections: WandDetections, true_s: Array, gap_s: float) -> BackgroundPoints:
+    """Match images of the same position of a point in several cameras.
+
+    A point that stands still has one position, and its images in a camera are averaged. One that moves has a position
+    at each of its times; images between two frames are interpolated.
+
+    Args:
+        detections: n images of background points.
+        true_s: (n,) true capture times.
+        gap_s: the longest time over which images are interpolated; 0 if only frames of equal time are simultaneous.
+    """
+    groups = [
+        group for rows in _by_number(detections.label) for group in _match(detections, true_s, rows, gap_s)
+    ]
+    if len(groups) > MAX_POINTS:
+        groups = [groups[k] for k in np.linspace(0, len(groups) - 1, MAX_POINTS).astype(int)]
+    if not groups:
+        return BackgroundPoints.none()
+    point = np.repeat(np.arange(len(groups)), [len(group.camera) for group in groups])
+    return BackgroundPoints(
+        point, *(np.concatenate([getattr(g, name) for g in groups]) for name in ("camera", "uv", "cov"))
+    )
+
+
+def _by_number(label: Index) -> list[Index]:
+    """The rows of each number."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _match(
+    detections: WandDetections, true_s: Array, rows: Index, gap_s: float
+) -> Iterator[BackgroundPoints]:
+    """The images of each position of one point, whose detections are `rows`, in two cameras or more."""
+    cameras = np.unique(detections.camera[rows]).tolist()
+    if len(cameras) < 2:
+        return
+    of_camera = [rows[detections.camera[rows] == camera] for camera in cameras]
+    if all(_stands_still(detections, mine) for mine in of_camera):
+        images = [_average(detections, mine) for mine in of_camera]
+        yield _one_point(cameras, np.array([uv for uv, _ in images]), np.array([cov for _, cov in images]))
+        return
+    # Where frames of equal time exist, every time counts; else those of the camera that saw the point most often.
+    times = np.unique(true_s[rows]) if gap_s == 0 else np.sort(true_s[max(of_camera, key=len)])
+    uv = np.array([_interpolate(detections, true_s, mine, times, gap_s) for mine in of_camera])
+    cov = np.array([np.median(detections.cov[mine], axis=0) for mine in of_camera])
+    known = np.isfinite(uv[:, :, 0])
+    for k in np.flatnonzero(known.sum(axis=0) >= 2).tolist():
+        seen = known[:, k]
+        yield _one_point(np.array(cameras)[seen].tolist(), uv[seen, k], cov[seen])
+
+
+def _one_point(cameras: list[int], uv: Array, cov: Array) -> BackgroundPoints:
+    return BackgroundPoints(np.zeros(len(cameras), np.intp), np.array(cameras), uv, cov)
+
+
+def _stands_still(detections: WandDetections, rows: Index) -> bool:
+    uv, variance = detections.uv[rows], np.median(np.einsum("nii->n", detections.cov[rows])) / 2
+    away = uv - np.median(uv, axis=0)
+    return bool(np.median((away**2).sum(axis=1)) <= 2 * STILL**2 * variance)
+
+
+def _average(detections: WandDetections, rows: Index) -> tuple[Array, Array]:
+    """The median of the images of a point that stands still, which one of many that are wrong does not change, and its
+    covariance: pi / 2 that of the mean."""
+    cov = np.median(detections.cov[rows], axis=0) * (np.pi / 2 if len(rows) > 2 else 1.0) / len(rows)
+    return np.median(detections.uv[rows], axis=0), cov + STILL_SIGMA_PX**2 * (len(rows) > 1) * np.eye(2)
+
+
+def _interpolate(detections: WandDetections, true_s: Array, rows: Index, times: Array, gap_s: float) -> Array:
+    """(k, 2) images at `times` (k,) of a point in one camera; NaN where it did not see the point about that time."""
+    order = rows[np.argsort(true_s[rows], kind="stable")]
+    fresh = np.diff(true_s[order], prepend=-np.inf) > SAME_S  # two images at once are no track
+    order = order[fresh]
+    return MarkerTrack.of(true_s[order], detections.uv[order]).interpolate(times, gap_s)

@@ -1,17 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The residuals of the wand's bundle adjustment, and what whitens them.
+"""The residuals of the wand's bundle adjustment, what whitens them, and their derivatives.
 
 Residuals are the reprojection errors of marker centres at their own capture times, deviations of the motion from
-constant velocity, of the wand from its lengths, and of cameras from their priors. See docs/design/wand_adjustment.md.
+constant velocity, of the wand from its lengths, and of cameras from their priors. `linearize` differentiates all of
+them in one NumPy batch: every observation depends on one camera and on the two knots around its time. The observations
+of one camera between two knots are a `view`: rows of derivatives by the knot, the next knot and the camera.
+
+Background points are eliminated, so that they constrain the cameras only. Their positions are optimal for the cameras
+of every state (variable projection: Golub and Pereyra 1973). With J the whitened derivatives of a point's pixels by its
+position and N an orthonormal basis of the null space of J^T, the rows of its pixels times N^T depend on the cameras
+alone (Mourikis and Roumeliotis 2007, section III-D). docs/design/wand_adjustment.md has the equations.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.rig.camera import POSE
-from calib.wand.bundle_adjustment.eliminated_points import BEHIND, point_error_norms
-from calib.wand.bundle_adjustment.problem import Problem, State, WandObservations
+from calib.rig.camera import LENS, PER_CAMERA, POSE, pixel_jacobians
+from calib.rig.triangulation import intersect
+from calib.wand.bundle_adjustment.problem import BackgroundPoints, Problem, State, WandObservations
 from calib.wand.trajectory import (
     SplineLocation,
     locate,
@@ -25,6 +33,13 @@ from camera_node.geometry.lens import Lens
 LENGTH_SIGMA_M = 2e-4  # by which a wand bends while it moves
 SPEED_SIGMA = 3.0  # metres per second of a hand
 SCALE_SIGMA = 1e-6  # relative, of a distance that fixes the scale
+STEP_SIGMA_M = 0.5  # of a position's change in one step: damps positions that too few cameras observe
+BEHIND = 1e4  # sigmas: the residual of a point behind its camera
+POINT_STEPS = 3  # of Gauss-Newton: a point moves little while its cameras take one step
+ROBUST_POINT_STEPS = 10
+CAUCHY_SCALE = 2.3849  # sigmas: 95 % efficient on normal residuals
+# Relative information that is added to every coordinate: a point on parallel rays stays where it is.
+REGULAR = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,3 +264,254 @@ def error_norms(
 def _cauchy(squares: Array, scale: float) -> float:
     """Sum of squares under Cauchy's kernel; plain where `scale` is infinite."""
     return float(squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum())
+
+
+@dataclass(frozen=True, slots=True)
+class PointInformation:
+    """Information of all background points on the cameras' d free parameters, the points eliminated.
+
+    Attributes:
+        information: (C, d, C, d).
+        scores: (J, C, d) gradients by point.
+    """
+
+    information: Array
+    scores: Array
+
+
+@dataclass(frozen=True, slots=True)
+class LinearSystem:
+    """The linear least-squares system for a step from a state.
+
+    Attributes:
+        problem: that was linearized.
+        views: (V,) interval between knots times C plus camera, ascending.
+        rows: (2n, m) sorted by view: whitened derivatives by the first knot (6 B), the next knot (6 B) and the
+            camera's free parameters (d), and the whitened residual.
+        bounds: (V + 1,) the first row of each view, and the number of rows.
+        chain: (L, 12 B + 1, 12 B + 1) augmented Hessians of the motion terms, by interval: knot k's own terms are in
+            interval k, the last knot's in the last interval.
+        motion_prior: (L, 12 B + 1, 12 B + 1) the part of `chain` from the prior of the motion: constant velocity and
+            zero speed.
+        priors: of the cameras.
+        background: information of the background points on the cameras.
+    """
+
+    problem: Problem
+    views: Index
+    rows: Array
+    bounds: Index
+    chain: Array
+    motion_prior: Array
+    priors: list[CameraPrior]
+    background: PointInformation
+
+
+def linearize(
+    problem: Problem, observations: WandObservations, state: State, weights: Weights
+) -> LinearSystem:
+    """Linearize all residuals around a state."""
+    motion = predict_markers(problem, observations, state)
+    error, J_camera, J_point = reprojection_jacobians(problem, observations, state, motion)
+    root = np.sqrt(weights.observation)[:, None, None] * weights.pixel
+    of_basis = problem.wand.weights[observations.label]
+    by_basis = (motion.hermite[:, :, None] * of_basis[:, None]).reshape(len(error), 1, -1, 1)
+    J_knots = (by_basis * (root @ J_point)[:, :, None]).reshape(len(error), 2, -1)
+    rows = np.concatenate([J_knots, root @ J_camera, root @ error[:, :, None]], axis=2)
+    view = motion.location.interval * len(problem.lenses) + observations.camera
+    order = np.argsort(view, kind="stable")
+    first = np.flatnonzero(np.diff(view[order], prepend=-1))
+    motion_prior = _linearize_prior(problem, state, weights)
+    return LinearSystem(
+        problem,
+        views=view[order][first],
+        rows=rows[order].reshape(-1, rows.shape[2]),
+        bounds=2 * np.append(first, len(view)),
+        chain=motion_prior + _linearize_lengths(problem, state),
+        motion_prior=motion_prior,
+        priors=camera_priors(problem, state),
+        background=eliminate_points(problem, state, weights.background),
+    )
+
+
+def reprojection_jacobians(
+    problem: Problem, observations: WandObservations, state: State, motion: MarkerMotion
+) -> tuple[Array, Array, Array]:
+    """Reprojection errors (n, 2), 0 behind the camera, and the derivatives of the predicted pixels by the camera's
+    free parameters (n, 2, d) and by the marker's position in the world (n, 2, 3)."""
+    points, velocity = motion.points, motion.velocity(problem.knot_s)
+    since = observations.t_s - problem.middle_s
+    error, J_point = np.zeros((len(observations), 2)), np.zeros((len(observations), 2, 3))
+    J_camera = np.zeros((len(observations), 2, PER_CAMERA))
+    for c, given in enumerate(problem.lenses):
+        rows, T, lens = np.flatnonzero(observations.camera == c), state.cameras[c], state.lens(c, given)
+        local = (points[rows] - T[:3, 3]) @ T[:3, :3]
+        uv, *parts = pixel_jacobians(lens, local)
+        J, J_pose, J_lens = (np.nan_to_num(part) for part in parts)
+        error[rows] = np.nan_to_num(observations.uv[rows] - uv)
+        J_point[rows] = J @ T[:3, :3].T
+        J_camera[rows, :, :6], J_camera[rows, :, LENS[0] :] = J_pose, J_lens
+    J_camera[:, :, 6] = (J_point @ velocity[:, :, None])[:, :, 0]
+    J_camera[:, :, 7] = J_camera[:, :, 6] * since[:, None]
+    J_camera[:, :, 8] = J_camera[:, :, 6] * observations.image_row[:, None]
+    return error, J_camera[:, :, list(problem.free)], J_point
+
+
+def _linearize_prior(problem: Problem, state: State, weights: Weights) -> Array:
+    """`LinearSystem.motion_prior`: constant velocity between knots, and zero speed at each."""
+    B, K = len(problem.wand.basis), len(state.motion)
+    local = 12 * B
+    smooth, _, speed = motion_errors(problem, state, weights)
+    chain = np.zeros((K - 1, local + 1, local + 1))
+    weighted = weights.interval[:, None, None] * weights.motion
+    H = np.einsum("lri,lrj->lij", weighted, weights.motion)
+    chain[:, :local, :local] = np.kron(H, np.eye(3 * B)[None])
+    chain[:, :local, -1] = -np.einsum("lri,lrbx->libx", weighted, smooth).reshape(K - 1, local)
+    H, g = np.diag(np.repeat([0.0, SPEED_SIGMA**-2], 3 * B)), np.zeros((K, 2, 3 * B))
+    g[:, 1] = -speed.reshape(K, -1) / SPEED_SIGMA
+    return _add_to_knots(chain, np.broadcast_to(H, (K, *H.shape)), g.reshape(K, -1))
+
+
+def _linearize_lengths(problem: Problem, state: State) -> Array:
+    """The part of `LinearSystem.chain` from the wand's lengths, and the damping."""
+    B, (K, local) = len(problem.wand.basis), (len(state.motion), 12 * len(problem.wand.basis))
+    gap = state.motion[:, 0][:, problem.wand.pairs]
+    gap = gap[:, :, 0] - gap[:, :, 1]
+    length = np.linalg.norm(gap, axis=2)
+    J = np.zeros((K, len(problem.wand.pairs), 2, B, 3))
+    for e, (i, j) in enumerate(problem.wand.pairs):
+        along = gap[:, e] / length[:, e, None] / LENGTH_SIGMA_M
+        J[:, e, 0, i], J[:, e, 0, j] = along, -along
+    J = J.reshape(K, -1, 6 * B)
+    error = (problem.wand.lengths - length) / LENGTH_SIGMA_M
+    H = np.swapaxes(J, 1, 2) @ J + np.diag(np.repeat([STEP_SIGMA_M**-2, 0.0], 3 * B))
+    return _add_to_knots(np.zeros((K - 1, local + 1, local + 1)), H, np.einsum("kri,kr->ki", J, error))
+
+
+def _add_to_knots(chain: Array, H: Array, g: Array) -> Array:
+    """Add Hessians (K, 6 B, 6 B) and gradients (K, 6 B) of the knots to a `chain`."""
+    half = g.shape[1]
+    for knots, intervals, at in ((slice(0, -1), slice(None), 0), (slice(-1, None), slice(-1, None), half)):
+        chain[intervals, at : at + half, at : at + half] += H[knots]
+        chain[intervals, at : at + half, -1] += g[knots]
+    return chain
+
+
+def start_points(problem: Problem, state: State, background: BackgroundPoints) -> tuple[Problem, State]:
+    """The problem with those background points that a state's cameras locate, and the state with their positions."""
+    points = _nearest_to_rays(problem, state, background)
+    known = np.asarray(np.isfinite(points).all(axis=1))
+    rows = np.flatnonzero(known[background.point])
+    problem = replace(problem, background=background.select(rows))
+    return problem, locate_points_robustly(problem, replace(state, points=points[known]))
+
+
+def locate_points(problem: Problem, state: State, used: Mask) -> State:
+    """The state with points that are optimal for its cameras, by Gauss-Newton from its own, from the images `used`."""
+    for _ in range(POINT_STEPS if len(state.points) else 0):
+        state = _step_points(problem, state, used.astype(float))
+    return state
+
+
+def locate_points_robustly(problem: Problem, state: State) -> State:
+    """The same from all images, with Cauchy's weights at a scale that the residuals give."""
+    for _ in range(ROBUST_POINT_STEPS if len(state.points) else 0):
+        norms = point_error_norms(problem, state)
+        scale = CAUCHY_SCALE * max(float(np.median(norms)) / 1.1774, 1.0)
+        state = _step_points(problem, state, 1 / (1 + (norms / scale) ** 2))
+    return state
+
+
+def point_error_norms(problem: Problem, state: State) -> Array:
+    """(n,) norms of the whitened reprojection errors of all images."""
+    return np.linalg.norm(_linearize_images(problem, state)[0], axis=1)
+
+
+def point_residuals(problem: Problem, state: State) -> Array:
+    """(n, 2) reprojection errors of all images, pixels; NaN behind the camera."""
+    background, errors = problem.background, np.empty_like(problem.background.uv)
+    for c, lens in enumerate(problem.lenses):
+        rows, T = background.camera == c, state.cameras[c]
+        local = (state.points[background.point[rows]] - T[:3, 3]) @ T[:3, :3]
+        errors[rows] = background.uv[rows] - state.lens(c, lens).project(local)
+    return errors
+
+
+def accept_images(problem: Problem, norms: Array, limit: float) -> Mask:
+    """(n,) images whose errors are below `limit` sigmas, of points that have two or more of these."""
+    accepted = norms < limit
+    count = np.bincount(problem.background.point[accepted], minlength=len(problem.background))
+    return accepted & (count >= 2)[problem.background.point]
+
+
+def eliminate_points(problem: Problem, state: State, used: Mask) -> PointInformation:
+    """Eliminate the points from the images `used` (n,)."""
+    C, d = len(problem.lenses), len(problem.free)
+    H, scores = np.zeros((C, d, C, d)), np.zeros((len(problem.background), C, d))
+    if not used.any():
+        return PointInformation(H, scores)
+    error, J_camera, J_point = _linearize_images(problem, state)
+    for rows, points in _group_by_cameras(problem.background, used):
+        cameras, (m, n) = problem.background.camera[rows[0]], rows.shape
+        free = np.linalg.qr(J_point[rows].reshape(m, 2 * n, 3), mode="complete").Q[:, :, 3:]
+        apart = np.zeros((m, n, 2, n, d))
+        apart[:, range(n), :, range(n)] = np.swapaxes(J_camera[rows], 0, 1)
+        J = np.swapaxes(free, 1, 2) @ apart.reshape(m, 2 * n, n * d)
+        residual = np.swapaxes(free, 1, 2) @ error[rows].reshape(m, 2 * n, 1)
+        G = np.einsum("mri,mrj->ij", J, J, optimize=True).reshape(n, d, n, d)
+        H[np.ix_(cameras, np.arange(d), cameras, np.arange(d))] += G
+        scores[points[:, None], cameras] = (np.swapaxes(J, 1, 2) @ residual).reshape(m, n, d)
+    return PointInformation(H, scores)
+
+
+def _group_by_cameras(background: BackgroundPoints, used: Mask) -> Iterator[tuple[Index, Index]]:
+    """The rows (m, n) of all m points that the same n cameras see, and the points (m,)."""
+    rows = np.flatnonzero(used)
+    point = background.point[rows]
+    seen = np.zeros((len(background), int(background.camera.max()) + 1), bool)
+    seen[point, background.camera[rows]] = True
+    patterns, of_point = np.unique(seen, axis=0, return_inverse=True)
+    for k, pattern in enumerate(patterns):
+        if (n := int(pattern.sum())) >= 2:
+            yield rows[of_point[point] == k].reshape(-1, n), np.flatnonzero(of_point == k)
+
+
+def _linearize_images(problem: Problem, state: State) -> tuple[Array, Array, Array]:
+    """Whitened errors (n, 2) of all images, observed less predicted, and the derivatives of the predicted ones by the
+    camera's free parameters (n, 2, d) and by the point (n, 2, 3), 0 behind the camera."""
+    background = problem.background
+    n, points = len(background.uv), state.points[background.point]
+    error, J_point, J_camera = np.empty((n, 2)), np.empty((n, 2, 3)), np.zeros((n, 2, PER_CAMERA))
+    for c, given in enumerate(problem.lenses):
+        rows, T = np.flatnonzero(background.camera == c), state.cameras[c]
+        uv, J, J_pose, J_lens = pixel_jacobians(state.lens(c, given), (points[rows] - T[:3, 3]) @ T[:3, :3])
+        error[rows], J_point[rows] = background.uv[rows] - uv, J @ T[:3, :3].T
+        J_camera[rows, :, :6], J_camera[rows, :, LENS[0] :] = J_pose, J_lens
+    root = np.linalg.inv(np.linalg.cholesky(background.cov))
+    errors = np.nan_to_num((root @ error[:, :, None])[:, :, 0], nan=BEHIND)
+    J_camera = J_camera[:, :, list(problem.free)]
+    return errors, np.nan_to_num(root @ J_camera), np.nan_to_num(root @ J_point)
+
+
+def _step_points(problem: Problem, state: State, weight: Array) -> State:
+    """One step of Gauss-Newton for all points, with weights (n,) of the images."""
+    error, _, J = _linearize_images(problem, state)
+    n, point = len(state.points), problem.background.point
+    H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    np.add.at(H, point, weight[:, None, None] * np.swapaxes(J, 1, 2) @ J)
+    np.add.at(g, point, weight[:, None] * (np.swapaxes(J, 1, 2) @ error[:, :, None])[:, :, 0])
+    regular = REGULAR * np.einsum("jii->j", H)[:, None, None] + np.finfo(float).tiny
+    step = np.linalg.solve(H + regular * np.eye(3), g[:, :, None])[:, :, 0]
+    return replace(state, points=state.points + step)
+
+
+def _nearest_to_rays(problem: Problem, state: State, background: BackgroundPoints) -> Array:
+    """(J, 3) the points nearest to their rays, robustly; NaN where these are nearly parallel."""
+    count, C = len(background), len(problem.lenses)
+    rays, known = np.zeros((C, 1, count, 3)), np.zeros((C, 1, count), bool)
+    for c, given in enumerate(problem.lenses):
+        rows = background.camera == c
+        ray = state.lens(c, given).rays(background.uv[rows]) @ state.cameras[c, :3, :3].T
+        known[c, 0, background.point[rows]] = np.isfinite(ray).all(axis=1)
+        rays[c, 0, background.point[rows]] = np.nan_to_num(ray)
+    return intersect(rays, state.cameras[:, :3, 3], known)[0][0]

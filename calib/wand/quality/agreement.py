@@ -10,7 +10,7 @@ from calib.errors import CalibrationError
 from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import adjoint, invert, rigid_motions, vector_from_rotation
 

@@ -1,24 +1,35 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Checks an adjustment against the files that it was given: lenses, camera names, and the wand's dimensions."""
+"""Checks an adjustment against the recording and against the files that it was given.
 
-from collections.abc import Sequence
+Lenses, camera names and the wand's dimensions must be those of the files. Residuals of detections at a given rig, each
+with its marker triangulated again (no motion prior, no wand length), show how well the rig describes detections that it
+was not adjusted to.
+
+Detections may be under the wrong camera: points of two cameras swapped, or of all rotated. Synchronous cameras: in
+every instant that contradicts the rig, detections are tried under other cameras, for all swaps of two cameras and all
+rotations of the cameras' order; the one under which all rays meet explains it. Other cameras: a detection that the
+adjustment rejects, but that is where another camera sees the marker, is of that camera.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, lens_parameters
+from calib.rig.triangulation import intersect
 from calib.wand.bundle_adjustment.covariance import camera_covariance
-from calib.wand.bundle_adjustment.optimizer import Adjusted
-from calib.wand.bundle_adjustment.problem import WandObservations
+from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_markers
-from calib.wand.detections import WandDetections, ranges
-from calib.wand.quality.clock_jump import find_jump
-from camera_node.foundation.arrays import Array, Index
+from calib.wand.detections import WandDetections, WandRecording, interpolate, ranges
+from calib.wand.wand_report import Exchange, Validation
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 
-MIN_AGREEING = 0.5  # share of a camera's detections that must fit the rig
 MAX_SIZE_ERROR = 0.04  # of the distance: the median error of roundel sizes is below it
 MAX_SPACING_ERROR = 0.03  # of the wand's length: the error of any distance between its markers is below it
 MIN_MEASURED = 8  # frame sets at which a distance is measured
@@ -28,6 +39,12 @@ WRONG_CLOCK_S = (
 )
 SAME_LENS = 3.0  # sigmas, per parameter, within which a lens is that of another camera
 OTHER_LENS = 1e-9  # probability of the difference, below which a lens is not that of its own file
+GROSS = 4.5  # standard deviations of the residuals: a larger one is a gross error, as in the adjustment
+RAYLEIGH_MEDIAN = 1.1774  # in standard deviations of one coordinate
+GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
+CLEARLY = 0.25  # of this distance, that the rays of synchronous cameras pass each other at most, if exchanged rightly
+MIN_SHARE, MIN_COUNT = 0.02, 8  # of a camera's detections, from which its points count as exchanged
+MIN_CAMERAS = 3  # that saw a marker at once: the rays of two meet for many exchanges
 
 
 def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
@@ -35,8 +52,14 @@ def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
     lenses, cov = adjusted.problem.lenses, camera_covariance(adjusted).of(LENS)
     found = [adjusted.state.lens(k, lens) for k, lens in enumerate(lenses)]
     for a, b in combinations(adjusted.problem.estimated_cameras(), 2):
-        crossed = _distance(found[a], lenses[b], cov[a, :, a]), _distance(found[b], lenses[a], cov[b, :, b])
-        straight = _distance(found[a], lenses[a], cov[a, :, a]), _distance(found[b], lenses[b], cov[b, :, b])
+        crossed = (
+            _lens_distance(found[a], lenses[b], cov[a, :, a]),
+            _lens_distance(found[b], lenses[a], cov[b, :, b]),
+        )
+        straight = (
+            _lens_distance(found[a], lenses[a], cov[a, :, a]),
+            _lens_distance(found[b], lenses[b], cov[b, :, b]),
+        )
         if max(crossed) < min(SAME_LENS, min(straight) / 2) and _probability(min(straight)) < OTHER_LENS:
             swapped = (
                 "its detections fit the intrinsics of '{}', and vice versa; swap the two in the rig file"
@@ -44,7 +67,7 @@ def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
             raise CameraFault({names[a]: swapped.format(names[b]), names[b]: swapped.format(names[a])})
 
 
-def _distance(found: Lens, given: Lens, cov: Array) -> float:
+def _lens_distance(found: Lens, given: Lens, cov: Array) -> float:
     """Distance of two lenses in sigmas, root mean square of the adjusted parameters."""
     off = lens_parameters(found) - lens_parameters(given)
     return float(np.sqrt(off @ np.linalg.solve(cov, off) / len(off)))
@@ -72,28 +95,6 @@ def check_clocks(names: Sequence[str], adjusted: Adjusted) -> None:
         )
 
 
-def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: WandObservations) -> None:
-    """Raise CameraFault where most detections of a camera contradict those of the other cameras.
-
-    Only the worst camera is named, because a wrong camera makes others look wrong. The d parameters of a camera's pose
-    and clock fit d coordinates of any detections, so these do not count.
-    """
-    total = np.bincount(observations.camera, minlength=len(names))
-    fitting = np.bincount(observations.camera[adjusted.used], minlength=len(names))
-    share = (fitting - len(set(adjusted.problem.free) - set(LENS)) / 2) / total
-    if share.min() < MIN_AGREEING:
-        k = int(share.argmin())
-        jump = find_jump(names, adjusted, observations)
-        if jump is not None and jump.camera == names[k]:
-            raise CameraFault({names[k]: jump.sentence()}, certain=False)
-        reason = (
-            f"only {fitting[k]} of its {total[k]} detections fit those of the other cameras: if it has few, wave the "
-            "wand in front of it; else check that its name and its intrinsics are its own and that it did not move; "
-            f"run roundel calibrate intrinsics --camera {names[k]}, or leave it out"
-        )
-        raise CameraFault({names[k]: reason}, certain=False)
-
-
 def check_motion(detections: WandDetections, names: Sequence[str], lenses: Sequence[Lens]) -> None:
     """Raise CalibrationError where no camera saw the wand move: a wand at rest determines little, and no clock."""
     moved, share = {}, {}
@@ -116,8 +117,8 @@ def check_spacing(wand: Body, adjusted: Adjusted, observations: WandObservations
     pairs = np.array(list(combinations(range(len(wand.markers)), 2)), np.intp)
     if len(pairs) < 2:
         return
-    given = _distances(wand.points[None], pairs)[0]
-    measured = _distances(triangulate_markers(adjusted, observations), pairs)
+    given = _pair_distances(wand.points[None], pairs)[0]
+    measured = _pair_distances(triangulate_markers(adjusted, observations), pairs)
     known = np.isfinite(measured).sum(axis=0) >= MIN_MEASURED
     if not known.any():
         return
@@ -175,11 +176,240 @@ def measure_lengths(adjusted: Adjusted, observations: WandObservations) -> Array
     """(n,) errors of the wand's lengths as the cameras alone measure them, metres."""
     wand = adjusted.problem.wand
     markers = triangulate_markers(adjusted, observations)
-    errors = _distances(markers[:, wand.basis], wand.pairs) - wand.lengths
+    errors = _pair_distances(markers[:, wand.basis], wand.pairs) - wand.lengths
     return errors[np.isfinite(errors)]
 
 
-def _distances(points: Array, pairs: Index) -> Array:
+def _pair_distances(points: Array, pairs: Index) -> Array:
     """(K, P) distances of P pairs of points (K, N, 3)."""
     ends = points[:, pairs]
     return np.asarray(np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2), float)
+
+
+@dataclass(frozen=True, slots=True)
+class TriangulatedResiduals:
+    """Residuals of n detections; NaN where fewer than two cameras saw the marker.
+
+    Attributes:
+        pixels: (n, 2) observed minus predicted pixels.
+        range_m: (n,) distances of the markers from their cameras.
+        focal_px: (n,) focal lengths of the cameras.
+    """
+
+    pixels: Array
+    range_m: Array
+    focal_px: Array
+
+    def summary(self) -> Validation | None:
+        """The residuals of all, and of those without gross errors; None where no two cameras saw a marker at once."""
+        known = np.isfinite(self.pixels).all(axis=1)
+        if not known.any():
+            return None
+        norms, distance = np.linalg.norm(self.pixels[known], axis=1), self.range_m[known]
+        fine = norms <= GROSS * np.median(norms) / RAYLEIGH_MEDIAN
+        return Validation(
+            count=len(norms),
+            all_px=_rms(norms),
+            gross=float((~fine).mean()),
+            residual_px=_rms(norms[fine]),
+            error_m=_rms((norms / self.focal_px[known] * distance)[fine]),
+            range_m=float(np.median(distance)),
+        )
+
+
+def triangulated_residuals(recording: WandRecording, state: State) -> TriangulatedResiduals:
+    """Triangulate the marker of each detection, robustly, from it and from the other cameras' detections at its true
+    time, equal or interpolated.
+
+    Args:
+        recording: labeled detections of C cameras.
+        state: poses, clocks and lenses of these cameras.
+    """
+    lenses = [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
+    recording = recording.with_row_times(state.clocks[:, 2]).undistort_tracks(lenses)
+    count = len(recording.detections)
+    pixels, range_m, focal_px = np.full((count, 2), np.nan), np.full(count, np.nan), np.empty(count)
+    for camera, lens in enumerate(lenses):
+        rows, T = np.flatnonzero(recording.detections.camera == camera), state.cameras[camera]
+        points = _triangulate_rows(recording, state, lens, camera, rows)
+        pixels[rows] = recording.detections.uv[rows] - lens.project((points - T[:3, 3]) @ T[:3, :3])
+        range_m[rows] = np.linalg.norm(points - T[:3, 3], axis=1)
+        focal_px[rows] = (lens.fx + lens.fy) / 2
+    return TriangulatedResiduals(pixels, range_m, focal_px)
+
+
+def _triangulate_rows(recording: WandRecording, state: State, lens: Lens, camera: int, rows: Index) -> Array:
+    """Return (r, 3) the markers of one camera's detections, world; NaN where no other camera saw them."""
+    detections = recording.detections.select(rows)
+    since = detections.t_s - recording.middle_s
+    xy = np.full((len(recording.lenses), len(rows), 2), np.nan)
+    for other, tracks in enumerate(recording.tracks):
+        offset, drift = state.clocks[camera, :2] - state.clocks[other, :2]
+        stamp_s = detections.t_s + offset + drift * since
+        xy[other] = interpolate(tracks, detections.label, stamp_s, recording.timing.gap_s)
+    xy[camera] = lens.normalise(detections.uv)
+    ray = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:2], 1))], axis=2)
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    ray = np.einsum("cij,crj->cri", state.cameras[:, :3, :3], ray)
+    return intersect(ray[:, None], state.cameras[:, :3, 3], np.isfinite(xy[:, None, :, 0]))[0][0]
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+@dataclass(frozen=True, slots=True)
+class FoundExchanges:
+    """Detections under the wrong camera.
+
+    Attributes:
+        pairs: who shows whose points, the most frequent first.
+        tested, wrong: (n,) detections of the recording that were tested, and those under the wrong camera.
+    """
+
+    pairs: list[Exchange]
+    tested: Mask
+    wrong: Mask
+
+
+def find_exchanges(
+    recording: WandRecording, adjusted: Adjusted, observations: WandObservations
+) -> FoundExchanges | None:
+    """Find the detections of a recording that are under the wrong camera; None where there are few or none."""
+    count = len(recording.detections)
+    tested, owner = np.zeros(count, bool), recording.detections.camera.copy()
+    if recording.timing.synchronous:
+        tested[:] = True
+        rows, owners = _try_exchanges(recording, adjusted.state)
+    else:
+        tested[observations.row] = True
+        rows, owners = _compare_with_motion(recording, adjusted, observations)
+    owner[rows] = owners
+    wrong = owner != recording.detections.camera
+    pairs = _count_exchanges(recording, tested, owner)
+    return FoundExchanges(pairs, tested, wrong) if pairs else None
+
+
+def _count_exchanges(recording: WandRecording, tested: Mask, owner: Index) -> list[Exchange]:
+    camera, names = recording.detections.camera, recording.names
+    total = np.bincount(camera[tested], minlength=len(names))
+    wrong = np.flatnonzero(owner != camera)
+    counts = Counter(zip(camera[wrong].tolist(), owner[wrong].tolist(), strict=True))
+    return [
+        Exchange(str(names[shown]), str(names[of]), n / int(total[shown]))
+        for (shown, of), n in counts.most_common()
+        if n >= max(MIN_COUNT, MIN_SHARE * total[shown])
+    ]
+
+
+def _compare_with_motion(
+    recording: WandRecording, adjusted: Adjusted, observations: WandObservations
+) -> tuple[Index, Index]:
+    """Rows (r,) of detections that are where another camera sees the marker, and (r,) that camera."""
+    rejected, state = observations.select(~adjusted.used), adjusted.state
+    if not len(rejected):
+        return rejected.row, rejected.camera
+    points = _interpolate_motion(adjusted, observations, rejected)
+    # The other camera's frame is up to a period earlier or later: the marker is nearer than it moves in this time.
+    inliers = predict_markers(adjusted.problem, observations.select(adjusted.used), state)
+    speed = float(np.median(np.linalg.norm(inliers.velocity(adjusted.problem.knot_s), axis=1)))
+    off, gate = np.empty((2, len(rejected), len(recording.names)))
+    for camera, lens in enumerate(_adjusted_lenses(recording, state)):
+        T = state.cameras[camera]
+        off[:, camera] = _pixel_distances(lens, T, points, rejected.uv)
+        moved_m = speed * recording.timing.period_s / np.linalg.norm(points - T[:3, 3], axis=1)
+        gate[:, camera] = GATE * max(lens.width, lens.height) + lens.fx * moved_m
+    every, own = np.arange(len(off)), rejected.camera
+    contradicts = off[every, own] > gate[every, own]
+    off[every, own] = np.inf
+    best = (off / gate).argmin(axis=1)
+    found = contradicts & (off[every, best] < gate[every, best])
+    return rejected.row[found], best[found]
+
+
+def _interpolate_motion(adjusted: Adjusted, observations: WandObservations, of: WandObservations) -> Array:
+    """(n, 3) positions of observed markers, world, between the nearest knots that two cameras or more determine: where
+    all detections of a frame set are wrong, its own knot is."""
+    problem, used = adjusted.problem, adjusted.used
+    views = np.zeros((len(problem.knot_s), len(problem.lenses)), bool)
+    views[observations.knot[used], observations.camera[used]] = True
+    known = views.sum(axis=1) >= 2
+    t_s = adjusted.state.true_times(of, problem.middle_s)
+    positions = adjusted.state.motion[known, 0].reshape(int(known.sum()), -1)
+    basis = np.column_stack([np.interp(t_s, problem.knot_s[known], column) for column in positions.T])
+    return np.einsum("nb,nbx->nx", problem.wand.weights[of.label], basis.reshape(len(t_s), -1, 3))
+
+
+def _pixel_distances(lens: Lens, T: Array, points: Array, uv: Array) -> Array:
+    """(n,) pixels between the images of points (n, 3), world, and uv (n, 2); infinite behind the camera."""
+    return np.nan_to_num(
+        np.linalg.norm(lens.project((points - T[:3, 3]) @ T[:3, :3]) - uv, axis=1), nan=np.inf
+    )
+
+
+def _try_exchanges(recording: WandRecording, state: State) -> tuple[Index, Index]:
+    """Rows (r,) of detections whose rays meet those of the others only under another camera, and (r,) that camera."""
+    table = _tabulate(recording)
+    cameras = len(recording.lenses)
+    table = table[(table >= 0).sum(axis=1) >= MIN_CAMERAS]
+    own = _misfit(recording, state, table, np.arange(cameras))
+    table = table[own > GATE]
+    best, choice = np.full(len(table), np.inf), np.zeros(len(table), np.intp)
+    orders = list(_orders(cameras))
+    for k, order in enumerate(orders):
+        misfit = _misfit(recording, state, table, order)
+        choice[misfit < best] = k
+        best = np.minimum(best, misfit)
+    found = best < CLEARLY * GATE
+    owners = np.array(orders)[choice[found]]
+    rows = table[found]
+    moved = (rows >= 0) & (owners != np.arange(cameras))
+    return rows[moved], owners[moved]
+
+
+def _orders(cameras: int) -> Iterator[Index]:
+    """All swaps of two cameras, and all rotations of their order: (C,) whose detections each camera shows."""
+    for a, b in combinations(range(cameras), 2):
+        order = np.arange(cameras)
+        order[[a, b]] = b, a
+        yield order
+    for shift in range(1, cameras):
+        yield np.roll(np.arange(cameras), shift)
+
+
+def _tabulate(recording: WandRecording) -> Index:
+    """(K, C) the detection of each camera, by instant and marker; -1 where it has none."""
+    detections = recording.detections
+    instant = np.unique(detections.t_s, return_inverse=True)[1]
+    key = instant * len(recording.wand.markers) + detections.label
+    _, place = np.unique(key, return_inverse=True)
+    table = np.full((int(place.max(initial=-1)) + 1, len(recording.lenses)), -1, np.intp)
+    table[place, detections.camera] = np.arange(len(detections))
+    return table
+
+
+def _misfit(recording: WandRecording, state: State, table: Index, order: Index) -> Array:
+    """(K,) largest distance of the detections of each row of a table (K, C) from the point where their rays meet, if
+    camera k shows the detections of camera order[k]; relative to the images' longer sides."""
+    cameras, lenses = len(order), _adjusted_lenses(recording, state)
+    uv = recording.detections.uv
+    known = np.zeros((cameras, 1, len(table)), bool)
+    ray, pixels = np.zeros((cameras, 1, len(table), 3)), np.full((cameras, len(table), 2), np.nan)
+    for shown in range(cameras):
+        of, rows = int(order[shown]), table[:, shown]
+        pixels[of] = np.where(rows[:, None] >= 0, uv[rows], np.nan)
+        xy = lenses[of].normalise(np.nan_to_num(pixels[of]))
+        known[of, 0] = (rows >= 0) & np.isfinite(xy).all(axis=1)
+        local = np.column_stack([np.nan_to_num(xy), np.ones(len(xy))])
+        ray[of, 0] = local / np.linalg.norm(local, axis=1, keepdims=True) @ state.cameras[of, :3, :3].T
+    points = intersect(ray, state.cameras[:, :3, 3], known, rounds=1)[0][0]
+    misfit = np.where(np.isfinite(points[:, 0]), 0.0, np.inf)
+    for camera, lens in enumerate(lenses):
+        seen = known[camera, 0]
+        off = _pixel_distances(lens, state.cameras[camera], points[seen], pixels[camera, seen])
+        misfit[seen] = np.maximum(misfit[seen], off / max(lens.width, lens.height))
+    return misfit
+
+
+def _adjusted_lenses(recording: WandRecording, state: State) -> list[Lens]:
+    return [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]

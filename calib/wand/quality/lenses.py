@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.rig.camera import LENS, lens_parameters
 from calib.wand.bundle_adjustment.covariance import camera_covariance
-from calib.wand.bundle_adjustment.optimizer import Adjusted
+from calib.wand.bundle_adjustment.problem import Adjusted
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 

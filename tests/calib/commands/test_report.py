@@ -9,7 +9,7 @@ from rich.console import Console
 
 from calib.commands.report import camera_table, print_report
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.assessment import assess
+from calib.wand.quality.grade import assess
 from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
 from tests.calib.recordings import WandScenario, record
 

@@ -9,10 +9,10 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
-from calib.wand.background import match_points
+from calib.wand.bundle_adjustment.problem_setup import match_points
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import gather
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body

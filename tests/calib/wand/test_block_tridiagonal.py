@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from calib.wand.block_tridiagonal import GROUP_SIZE, BlockTridiagonal
+from calib.wand.bundle_adjustment.optimizer import GROUP_SIZE, BlockTridiagonal
 from camera_node.foundation.arrays import Array
 
 # Scalars of a block, and blocks: less than a group, whole groups, and a part of one at the end; blocks above a group.

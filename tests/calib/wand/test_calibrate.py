@@ -10,10 +10,10 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
-from calib.wand.calibrate import calibrate, explain_disagreement
-from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling.labels import label_recording
-from calib.wand.result import WandCalibration
+from calib.wand.calibrate import calibrate
+from calib.wand.initial_rig import TwoViewGeometry, explain_disagreement
+from calib.wand.labels import label_recording
+from calib.wand.wand_report import WandCalibration
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.synthetic import CAREFUL, WAND, Arena, assert_near, joint_error, record, ring, roughly

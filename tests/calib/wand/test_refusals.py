@@ -13,10 +13,10 @@ from calib.commands.report import MAX_GROSS, print_report
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.labeling.labels import label_recording
-from calib.wand.labeling.spacing import MAX_ROUNDELS
-from calib.wand.quality.assessment import assess
+from calib.wand.labels import label_recording
+from calib.wand.quality.grade import assess
 from calib.wand.recalibration import recalibrate_camera
+from calib.wand.spacing import MAX_ROUNDELS
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

@@ -10,8 +10,8 @@ from calib.commands.report import print_report
 from calib.rig.camera import OFFSET, READOUT
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.assessment import assess
-from calib.wand.result import WandCalibration
+from calib.wand.quality.grade import assess
+from calib.wand.wand_report import WandCalibration
 from camera_node.geometry.body import Body
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import joint_error

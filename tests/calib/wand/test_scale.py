@@ -14,8 +14,9 @@ from calib.errors import CalibrationError
 from calib.live.trials import WandSession, compute_trial
 from calib.rig.rig import load_rig, save_rig
 from calib.wand.calibrate import calibrate
+from calib.wand.conclusion import compare_distance
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
-from calib.wand.scale import Distance, compare_distance
+from calib.wand.scale import Distance
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.sources.recorded_detections import write_observations

@@ -10,7 +10,7 @@ import pytest
 
 from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rotation_from_vector

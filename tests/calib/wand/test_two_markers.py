@@ -10,10 +10,9 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
-from calib.wand.detections import gather
-from calib.wand.labeling.two_markers import label_ends
-from calib.wand.result import WandCalibration
-from calib.wand.timing import Timing
+from calib.wand.detections import Timing, gather
+from calib.wand.labels import label_ends
+from calib.wand.wand_report import WandCalibration
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.recordings import SimulatedRecording, WandScenario, record

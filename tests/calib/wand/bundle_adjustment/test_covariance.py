@@ -10,7 +10,7 @@ from scipy.stats import chi2 as chi_square
 from calib.commands.check import split_halves
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body

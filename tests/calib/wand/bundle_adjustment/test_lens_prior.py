@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from calib.rig.camera import stated_sigma
 from calib.rig.rig import Rig
-from calib.wand.bundle_adjustment.lens_prior import (
+from calib.wand.bundle_adjustment.covariance import (
     KINDS,
     SHARES,
     UNIFORM,
@@ -20,9 +20,9 @@ from calib.wand.bundle_adjustment.lens_prior import (
     widen_lenses,
 )
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.assessment import assess
+from calib.wand.quality.grade import assess
 from calib.wand.recalibration import recalibrate_camera
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, SHEET, camera_errors, joint_error, roughly
 
@@ -166,9 +166,10 @@ def test_widened_priors_make_the_covariance_of_changed_lenses_right():
     focal, centre_px, k1 = (2.5 * value for value in CAREFUL)
     narrow, wide, degrees = 0.0, 0.0, 0
     for seed in SEEDS:
-        rig = widen_lenses(roughly(recorded(seed).intrinsics, (focal, centre_px, k1), True, seed), 1 / 2.5)
+        rig = roughly(recorded(seed).intrinsics, (focal, centre_px, k1), True, seed)
         for factor in (1.0, 2.5):
-            result = calibrate(widen_lenses(rig, factor), WandScenario().wand, recorded(seed).messages)
+            widened = Rig(cameras=widen_lenses(rig.cameras, factor / 2.5))
+            result = calibrate(widened, WandScenario().wand, recorded(seed).messages)
             squared, more = joint_error(result, recorded(seed).truth)
             narrow, wide = (narrow + squared, wide) if factor == 1 else (narrow, wide + squared)
         degrees += more
@@ -176,8 +177,7 @@ def test_widened_priors_make_the_covariance_of_changed_lenses_right():
 
 
 def test_lenses_without_standard_deviations_are_widened_from_the_usual_ones():
-    rig = widen_lenses(recorded(1).intrinsics, 3.0)
-    for camera in rig.cameras.values():
+    for camera in widen_lenses(recorded(1).intrinsics.cameras, 3.0).values():
         sigma = calibrated_sigma(camera)
         assert sigma is not None
         assert np.allclose(sigma[1:4], 3 * usual_sigma(camera)[1:4])

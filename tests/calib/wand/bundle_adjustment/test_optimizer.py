@@ -13,14 +13,16 @@ from calib.rig.camera import DRIFT, LENS, OFFSET, PER_CAMERA, POSE, READOUT
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.disc_centres import displacement
-from calib.wand.bundle_adjustment.linear_system import reprojection_jacobians
 from calib.wand.bundle_adjustment.problem import gauge_directions
-from calib.wand.bundle_adjustment.residuals import predict_markers, reprojection_errors
+from calib.wand.bundle_adjustment.residuals import (
+    predict_markers,
+    reprojection_errors,
+    reprojection_jacobians,
+)
 from calib.wand.calibrate import calibrate
-from calib.wand.detections import gather
-from calib.wand.initialization.two_view import TwoViewGeometry
-from calib.wand.labeling.labels import label
-from calib.wand.timing import Timing
+from calib.wand.detections import Timing, gather
+from calib.wand.initial_rig import TwoViewGeometry
+from calib.wand.labels import label
 from calib.wand.trajectory import locate, position_weights, velocity_weights
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import skew

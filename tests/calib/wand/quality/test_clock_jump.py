@@ -5,7 +5,7 @@ import msgspec
 import pytest
 
 from calib.wand.calibrate import calibrate
-from calib.wand.result import WandCalibration
+from calib.wand.wand_report import WandCalibration
 from tests.calib.recordings import EPOCH_S, WandScenario, record
 from tests.calib.synthetic import OLD, roughly
 

@@ -8,9 +8,8 @@ import pytest
 
 from calib.rig.coverage import Coverage
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.assessment import assess
-from calib.wand.quality.grade import ADVICE, GRADES, LIMITS, CameraQuality, RigQuality, grade
-from calib.wand.report import Validation
+from calib.wand.quality.grade import ADVICE, GRADES, LIMITS, CameraQuality, RigQuality, assess, grade
+from calib.wand.wand_report import Validation
 from tests.calib.synthetic import record, ring
 
 

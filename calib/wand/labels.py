@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Distinguishes the ends of a wand of two markers that look alike.
+"""Assigns the detections of a recording to the markers of the wand.
 
-Swapping the ends in all frames of all cameras changes nothing; swapping them in one camera does. From frame to frame of
-a camera the wand turns little: frames are chained into segments with one unknown sign each. Between cameras, rays to
-the same end meet and rays to different ends do not: for two segments that overlap in time, the epipolar residuals of
-both labelings give a log likelihood ratio (`_epipolar_evidence`). All signs together are a synchronization over Z2
-(Singer 2011): the maximum spanning tree of the evidence, then a greedy flip of single signs.
+Detections that carry marker numbers keep them. A wand of three or more markers is found by its spacing (`spacing`), the
+ends of a wand of two markers are distinguished over time and between cameras. Labels then propagate to frames in which
+markers are missing, from the frames before and after.
 
-The camera poses come from an initial rig of the wand's middle, treated as a wand of one marker: the middle of two image
-points is nearly the image of the middle and needs no labels. A second pass uses the labeled ends.
+The ends of two markers that look alike: swapping them in all frames of all cameras changes nothing; swapping them in
+one camera does. From frame to frame of a camera the wand turns little: frames are chained into segments with one
+unknown sign each. Between cameras, rays to the same end meet and rays to different ends do not: for two segments that
+overlap in time, the epipolar residuals of both labelings give a log likelihood ratio (`_epipolar_evidence`). All signs
+together are a synchronization over Z2 (Singer 2011): the maximum spanning tree of the evidence, then a greedy flip of
+single signs. The camera poses come from an initial rig of the wand's middle, treated as a wand of one marker: the
+middle of two image points is nearly the image of the middle and needs no labels. A second pass uses the labeled ends.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -20,28 +24,166 @@ import numpy as np
 from msgspec.structs import replace as replace_fields
 from numpy.typing import NDArray
 
-from calib.wand.detections import WandDetections
-from calib.wand.initialization.initial_rig import InitialRig, build_initial_rig
-from calib.wand.initialization.two_view import TwoViewGeometry, sampson
-from calib.wand.timing import Timing
+from calib.rig.rig import Rig
+from calib.wand.detections import FrameTable, Timing, WandDetections, WandRecording, build_tracks, gather
+from calib.wand.initial_rig import InitialRig, TwoViewGeometry, build_initial_rig, sampson
+from calib.wand.spacing import MAX_ROUNDELS, label_by_spacing, require_distinct
 from calib.wand.trajectory import finite_velocities, hermite
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, skew
+from camera_node.protocol.messages import Detections
 
 if TYPE_CHECKING:
     from scipy.sparse import coo_array
 
-
+# Gate of propagation: distance from the interpolated position, and its part of the marker's displacement.
+GATE_PX, GATE_SHARE = 8.0, 0.15
+MAX_FRAMES = 3.5  # frame periods between the two labeled frames that propagation interpolates
 MAX_TURN = 0.5  # change of the wand's image vector, relative to the change by a swap: a turn of 53 degrees
 CHAIN_S, CHAIN_PERIODS = 0.2, 1.5  # longest gap within a run: the larger of the two
 CLEAR = 3.0  # times the usual change between frames: a longer image vector has not reversed
 FASTEST = 1.0  # change of the image vector, image plane units per second, where no two frames give it
-SAME_S = 5e-4  # frames closer in time count as simultaneous
+SIMULTANEOUS_S = 5e-4  # frames closer in time count as simultaneous
 COARSE_PX, FINE_PX = 3.0, 1.5  # scale of epipolar residuals with the poses of the middles, and of the ends
 MIN_EVIDENCE = 6.0  # log likelihood ratio of a sign that is accepted
 SEPARATION_S = 1e4  # added between runs, so that nothing is interpolated across them
+
+
+def label_recording(
+    rig: Rig, wand: Body, messages: Sequence[Detections], synchronous: bool = False
+) -> WandRecording:
+    """Collect the detections of a recording, of `synchronous` cameras or of others, and label them.
+
+    Raises:
+        CalibrationError: see `label`.
+    """
+    names = sorted({message.camera for message in messages})
+    lenses = [rig.cameras[name] for name in names]
+    frames, detections = gather(messages, names, lenses)
+    timing = Timing(frames.period_s(), synchronous)
+    detections, left_out = label(frames, timing, detections, wand, lenses)
+    last = np.searchsorted(frames.camera, range(len(names)), side="right") - 1
+    return WandRecording(
+        names,
+        list(lenses),
+        wand,
+        frames,
+        timing,
+        detections,
+        build_tracks(detections, len(names), len(wand.markers)),
+        left_out,
+        middle_s=float(frames.t_s.min() + frames.t_s.max()) / 2,
+        readout_s=frames.readout_s[last],
+    )
+
+
+def label(
+    frames: FrameTable, timing: Timing, detections: WandDetections, wand: Body, lenses: Sequence[Lens]
+) -> tuple[WandDetections, list[Counter[str]]]:
+    """Label the detections that are markers of the wand.
+
+    Returns:
+        labeled: the labeled rows, at most one per frame and marker.
+        left_out: by camera, the number of frames without a labeled detection by reason.
+
+    Raises:
+        CalibrationError: the wand is symmetric and the detections carry no numbers.
+    """
+    labels, reason = _assign_labels(frames, timing, detections, wand, lenses)
+    left_out = [Counter() for _ in lenses]
+    without = np.setdiff1d(np.arange(len(frames.t_s)), detections.frame[labels >= 0])
+    for camera, why in zip(frames.camera[without].tolist(), reason[without].tolist(), strict=True):
+        left_out[camera][why] += 1
+    return replace(detections, label=labels).select(np.flatnonzero(labels >= 0)), left_out
+
+
+def _assign_labels(
+    frames: FrameTable, timing: Timing, detections: WandDetections, wand: Body, lenses: Sequence[Lens]
+) -> tuple[Index, NDArray[np.object_]]:
+    """Return the label (n,) of each detection, -1 for none, and the reason (F,) that applies to frames without one."""
+    markers = len(wand.markers)
+    counts = np.bincount(detections.frame, minlength=len(frames.t_s))
+    few = counts < min(3, markers)
+    reason = np.where(few, "too few roundels in the frame", "no wand among the roundels").astype(object)
+    if (detections.label >= 0).any():
+        reason[counts > 0] = "no marker of the wand in the frame"
+        return _label_by_number(detections, markers), reason
+    if markers == 1:
+        reason[counts > 1] = "ambiguous"
+        return np.where(counts[detections.frame] == 1, 0, -1), reason
+    if markers == 2:
+        reason[counts == 2] = "the ends of the wand cannot be distinguished"
+        reason[counts > 2] = "ambiguous"
+        labels = label_ends(timing, detections, wand, lenses)
+    else:
+        require_distinct(wand)
+        reason[counts > MAX_ROUNDELS] = f"more than {MAX_ROUNDELS} roundels in the frame"
+        labels, ambiguous = label_by_spacing(detections, wand, lenses)
+        reason[ambiguous] = "ambiguous"
+    if not timing.synchronous:
+        labels = propagate_labels(frames, detections, labels, markers)
+    return labels, reason
+
+
+def _label_by_number(detections: WandDetections, markers: int) -> Index:
+    """Return the numbers that detections carry; -1 for numbers of no marker, or twice in a frame."""
+    valid = (detections.label >= 0) & (detections.label < markers)
+    key = np.where(valid, detections.frame * markers + detections.label, -1)
+    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    return np.where(valid & (count[inverse] == 1), detections.label, -1)
+
+
+def propagate_labels(frames: FrameTable, detections: WandDetections, labels: Index, markers: int) -> Index:
+    """Label detections near the position of a marker, interpolated between two labeled frames of its camera.
+
+    A detection takes the label of the nearest marker, and a marker the nearest detection of a frame.
+    """
+    labels = labels.copy()
+    gap_s = MAX_FRAMES * frames.period_s()
+    for camera in np.unique(frames.camera):
+        mine = detections.camera == camera
+        rows = np.flatnonzero(mine & (labels < 0))
+        known = [np.flatnonzero(mine & (labels == marker)) for marker in range(markers)]
+        distance = np.column_stack([_gated_distances(detections, rows, k, gap_s) for k in known])
+        chosen, marker = _match_nearest(detections.frame[rows], distance)
+        labels[rows[chosen]] = marker
+    return labels
+
+
+def _gated_distances(detections: WandDetections, rows: Index, known: Index, gap_s: float) -> Array:
+    """Return distances (r,), pixels, of detections from a marker interpolated between its labeled rows `known`.
+
+    Infinite outside the gate, in frames that have the marker, and in gaps above `gap_s`.
+    """
+    if len(known) < 2:
+        return np.full(len(rows), np.inf)
+    t_s, uv, frame = detections.t_s, detections.uv, detections.frame
+    after = np.searchsorted(t_s[known], t_s[rows])
+    inside = (after > 0) & (after < len(known)) & ~np.isin(frame[rows], frame[known])
+    a, b = known[np.clip(after - 1, 0, None)], known[np.clip(after, None, len(known) - 1)]
+    dt = np.maximum(t_s[b] - t_s[a], 1e-9)
+    share = ((t_s[rows] - t_s[a]) / dt)[:, None]
+    distance = np.linalg.norm(uv[rows] - (1 - share) * uv[a] - share * uv[b], axis=1)
+    gate = GATE_PX + GATE_SHARE * np.linalg.norm(uv[b] - uv[a], axis=1)
+    return np.where(inside & (dt <= gap_s) & (distance < gate), distance, np.inf)
+
+
+def _match_nearest(frame: Index, distance: Array) -> tuple[Index, Index]:
+    """Match each row to its nearest marker, and each marker to its nearest row of a frame; return rows and markers.
+
+    Args:
+        frame: (r,) of each row.
+        distance: (r, M), infinite where a row and a marker do not match.
+    """
+    nearest = distance.argmin(axis=1)
+    least = distance[np.arange(len(distance)), nearest]
+    order = np.lexsort((least, nearest, frame))
+    key = frame[order] * (distance.shape[1] + 1) + nearest[order]
+    first = np.diff(key, prepend=-1) != 0
+    chosen = order[first & np.isfinite(least[order])]
+    return chosen, nearest[chosen]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +254,7 @@ class _StickTracks:
         ends = np.einsum("nh,nhex->nex", hermite(tau, dt), knots)
         inside = (sticks.run[left] == sticks.run[right]) & (dt <= self.gap_s) & (tau >= 0) & (tau <= dt)
         nearest = np.where(tau > dt / 2, right, left)
-        simultaneous = np.abs(sticks.t_s[nearest] - t_s) < SAME_S
+        simultaneous = np.abs(sticks.t_s[nearest] - t_s) < SIMULTANEOUS_S
         ends = np.where(simultaneous[:, None, None], sticks.xy[nearest], ends)
         ends[~(inside | simultaneous)] = np.nan
         return ends, sticks.segment[nearest]

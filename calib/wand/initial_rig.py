@@ -1,0 +1,608 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Builds an initial rig: two-view geometry of pairs of cameras, chained along a maximum spanning tree.
+
+The essential matrix (Nister 2004) gives the relative pose of two cameras up to scale; the wand's lengths, or the
+roundels' sizes, give the scale. The clock shift of two cameras whose relative pose is unknown: at the right shift,
+simultaneous detections of both satisfy one epipolar constraint; at a wrong shift the wand has moved. The eight-point
+algorithm (Hartley 1997) fits a fundamental matrix robustly to each trial shift.
+
+Why a camera could not be placed (a wrong clock, a mirrored image, or too few common detections) is tested by undoing
+each fault: if a camera fits another one after its timestamps are shifted, or its image is mirrored, it has that fault.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from calib.errors import CameraFault
+from calib.rig.camera import transform
+from calib.wand.detections import (
+    SAME_S,
+    FrameTable,
+    MarkerTrack,
+    Timing,
+    WandDetections,
+    build_tracks,
+    interpolate,
+    ranges,
+)
+from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import invert
+
+MIN_FRAME_SETS = 8  # that two cameras must share
+SAMPLE = 1500  # detections that the essential matrix is fitted to
+GATE_PX = 5.0
+MAX_SPREAD = 0.15  # of the logarithm of the scale, over the wand's lengths: a larger one rejects the pose
+QUANTILE = 0.3  # of Sampson distances, that are compared: 30 % of the correspondences are right at the least
+MIN_INLIER_RATIO = 0.5  # of the correspondences: fewer inliers reject a pose
+MAX_SHIFT_S = 0.32  # largest trial shift: twice the difference of clocks that the server synchronizes
+SHIFT_STEP_S = 0.01
+SHIFT_SAMPLE = 500  # detections that are used
+REWEIGHTINGS = 5  # of reweighting
+# A shift is accepted if it raises the logarithm of the likelihood by this much: the best of many trials is better than
+# no shift by chance, and the parameters of the fundamental matrix are fitted to each trial.
+EVIDENCE = 12.0
+FITTED = 8
+MIN_COMMON = 16  # correspondences of a trial
+MIN_TIMES = 15  # timestamps with correspondences; the markers of one frame add little information
+# Inlier ratio and frames of two cameras once the fault is undone: a short piece of a smooth path fits many geometries.
+MIN_FAULT_RATIO, MIN_FAULT_FRAMES = 0.8, 60
+UNSYNCHRONIZED_S, UNSYNCHRONIZED_STEP_S = 10.0, 0.04  # of the shifts of an unsynchronized clock
+APART_S = 2.0  # least gap between recordings; cameras of one recording may start one after the other
+MIN_MISFIT = 1e-6  # of the image plane
+FAULT_SAMPLE = 200  # detections that are used
+
+
+@dataclass(frozen=True, slots=True)
+class TwoView:
+    """Relative pose and clock shift of two cameras.
+
+    Attributes:
+        a, b: their indices.
+        T_a_b: (4, 4) p_a = T_a_b p_b, metres if `metric`, else its translation has length 1.
+        shift_s: time by which b's timestamps are later than a's.
+        inliers: number of detections of a that agree.
+        inlier_ratio: the part of the correspondences that are inliers.
+        metric: whether the scale is known.
+        depth: distance from its camera to the marker by detection (row), in the unit of T_a_b.
+    """
+
+    a: int
+    b: int
+    T_a_b: Array
+    shift_s: float
+    inliers: int
+    inlier_ratio: float
+    metric: bool
+    depth: dict[int, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Correspondences:
+    """Detections `rows` (n,) of camera a, and both cameras' image plane coordinates (n, 2) of the same markers."""
+
+    rows: Index
+    xy_a: Array
+    xy_b: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _RelativePose:
+    """T_a_b with a translation of length 1, its inliers (n,), and a low quantile of the Sampson distances."""
+
+    matches: _Correspondences
+    T_a_b: Array
+    inlier: Mask
+    misfit: float
+
+
+class TwoViewGeometry:
+    """Relative poses of the pairs of cameras of a labeled recording, computed on demand.
+
+    Args:
+        detections: labeled, of all cameras.
+        lenses: of the C cameras.
+        wand: its markers.
+        timing: how the cameras' frames are related in time.
+    """
+
+    def __init__(
+        self, detections: WandDetections, lenses: Sequence[Lens], wand: Body, timing: Timing
+    ) -> None:
+        self.detections, self.lenses, self.wand = detections, lenses, wand
+        self.rows = [np.flatnonzero(detections.camera == k) for k in range(len(lenses))]
+        self.tracks: list[list[MarkerTrack]] = build_tracks(detections, len(lenses), len(wand.markers))
+        self.timing, self.gap_s = timing, timing.gap_s
+        self._known: dict[tuple[int, int], TwoView | None] = {}
+        self._ranges = ranges(lenses, detections, wand.diameter_m)
+
+    def with_detections(self, detections: WandDetections) -> "TwoViewGeometry":
+        """Return the geometry of the same cameras with other detections."""
+        return TwoViewGeometry(detections, self.lenses, self.wand, self.timing)
+
+    def count_shared(self) -> Index:
+        """Return (C, C) the number of frame sets that two cameras share: of equal stamps for synchronous cameras, else
+        approximately, one frame period long."""
+        t_s = self.detections.t_s
+        if self.timing.synchronous:
+            bins = np.unique(t_s, return_inverse=True)[1]
+        else:
+            bins = (t_s / max(self.timing.period_s, 0.02)).astype(np.intp)
+        held = np.zeros((len(self.lenses), int(bins.max(initial=0)) + 1))
+        held[self.detections.camera, bins] = 1
+        if self.timing.synchronous:
+            return (held @ held.T).astype(np.intp)
+        near = np.maximum(held, np.roll(held, 1, axis=1))
+        return (near @ near.T / 2).astype(np.intp)
+
+    def relate(self, a: int, b: int) -> TwoView | None:
+        """Return the relative pose of two cameras; None if the data do not determine it."""
+        if (a, b) not in self._known:
+            self._known[a, b] = self._estimate(a, b)
+        return self._known[a, b]
+
+    def _estimate(self, a: int, b: int) -> TwoView | None:
+        pose, shift_s = self._estimate_with_shift(a, b)
+        if pose is None:
+            return None
+        matches, T_a_b = pose.matches, pose.T_a_b.copy()
+        inliers = matches.rows[pose.inlier]
+        if self._count_frames(inliers) < MIN_FRAME_SETS:
+            return None
+        points = intersect_rays(T_a_b, matches.xy_a[pose.inlier], matches.xy_b[pose.inlier])
+        ratios = self._scale_ratios(points, inliers)
+        scale = float(np.median(ratios)) if len(ratios) else 1.0
+        if len(ratios) and np.median(np.abs(np.log(ratios / scale))) > MAX_SPREAD:
+            return None
+        T_a_b[:3, 3] *= scale
+        points_b = transform(invert(T_a_b), points * scale)
+        depth = _lengths(inliers, points * scale) | self._depths_of_b(inliers, points_b, b, shift_s)
+        ratio = len(inliers) / len(matches.rows)
+        return TwoView(a, b, T_a_b, shift_s, len(inliers), ratio, len(ratios) > 0, depth)
+
+    def _estimate_with_shift(self, a: int, b: int) -> tuple[_RelativePose | None, float]:
+        """Return the relative pose up to scale and the clock shift, 0 unless the data show one."""
+        rows = self._overlapping_rows(a, b)
+        if self.timing.synchronous:
+            return self._fit_pose(a, b, rows, 0.0), 0.0
+        selected = self.detections.select(rows)
+        shift_s = find_shift(self.tracks[b], selected, self.gap_s)
+        unshifted = self._fit_pose(a, b, rows, 0.0)
+        shifted = self._fit_pose(a, b, rows, shift_s) if shift_s else None
+        if shifted is None:
+            return unshifted, 0.0
+        counts = len(shifted.matches.rows), len(np.unique(selected.t_s))
+        if unshifted is not None and not supports_shift(unshifted.misfit, shifted.misfit, *counts):
+            return unshifted, 0.0
+        return shifted, shift_s
+
+    def _overlapping_rows(self, a: int, b: int) -> Index:
+        """Return rows of camera a at times when b has detections, clock shift apart.
+
+        Whole frames, because the markers of a frame give the scale; at most about SAMPLE rows.
+        """
+        rows, t_s = self.rows[a], self.detections.t_s
+        times = np.unique(t_s[self.rows[b]])
+        if not len(times) or not len(rows):
+            return rows[:0]
+        before = np.clip(np.searchsorted(times, t_s[rows]), 1, max(len(times) - 1, 1)) - 1
+        before = np.minimum(before, len(times) - 1)
+        after = np.minimum(before + 1, len(times) - 1)
+        gap = np.minimum(np.abs(times[before] - t_s[rows]), np.abs(times[after] - t_s[rows]))
+        near = rows[gap <= self.gap_s + SAME_S]
+        frames = np.unique(self.detections.frame[near])
+        count = max(round(SAMPLE * len(frames) / max(len(near), 1)), 1)
+        chosen = frames[spread_evenly(len(frames), count)]
+        return near[np.isin(self.detections.frame[near], chosen)]
+
+    def _correspond(self, rows: Index, b: int, shift_s: float) -> _Correspondences:
+        """Return correspondences of detections `rows` with camera b, whose timestamps are `shift_s` later."""
+        found = self.detections.select(rows)
+        other = interpolate(self.tracks[b], found.label, found.t_s + shift_s, self.gap_s)
+        good = np.isfinite(other[:, 0])
+        return _Correspondences(rows[good], found.xy[good], other[good])
+
+    def _fit_pose(self, a: int, b: int, rows: Index, shift_s: float) -> _RelativePose | None:
+        """Fit the essential matrix to the detections `rows` of camera a at a clock shift."""
+        matches = self._correspond(rows, b, shift_s)
+        if self._count_frames(matches.rows) < MIN_FRAME_SETS:
+            return None
+        xy_a, xy_b, K = matches.xy_a, matches.xy_b, np.eye(3)
+        gate = GATE_PX / ((self.lenses[a].fx + self.lenses[a].fy) / 2)
+        E, mask = cv2.findEssentialMat(xy_a, xy_b, K, cv2.USAC_ACCURATE, 0.9999, gate)[:2]
+        if E is None or E.shape != (3, 3):
+            return None
+        _, R, t, mask = cv2.recoverPose(E, xy_a, xy_b, K, mask=mask)[:4]
+        T_b_a = np.eye(4)
+        T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
+        distances = sampson(np.asarray(E, float), xy_a, xy_b)
+        return _RelativePose(
+            matches, invert(T_b_a), mask.ravel() > 0, float(np.quantile(distances, QUANTILE))
+        )
+
+    def _count_frames(self, rows: Index) -> int:
+        return len(np.unique(self.detections.frame[rows]))
+
+    def _scale_ratios(self, points: Array, rows: Index) -> Array:
+        """Return the factors (r,) that give the wand its lengths, or else the roundels their ranges."""
+        frame, label = self.detections.frame[rows], self.detections.label[rows]
+        table = np.full((len(np.unique(frame)), len(self.wand.markers), 3), np.nan)
+        table[np.unique(frame, return_inverse=True)[1], label] = points
+        gaps = np.linalg.norm(table[:, :, None] - table[:, None], axis=3)
+        known = np.linalg.norm(self.wand.points[:, None] - self.wand.points[None], axis=2)
+        upper = np.triu(np.ones(known.shape, bool), 1)
+        ratios = (known / np.where(gaps > 0, gaps, np.nan))[:, upper].ravel()
+        if not np.isfinite(ratios).any():
+            ratios = self._ranges[rows] / np.linalg.norm(points, axis=1)
+        return ratios[np.isfinite(ratios)]
+
+    def _depths_of_b(self, rows: Index, points: Array, b: int, shift_s: float) -> dict[int, float]:
+        """Return distances from camera b to points (n, 3) in its frame, at its detections nearest in time."""
+        label, t_s = self.detections.label, self.detections.t_s
+        depth: dict[int, float] = {}
+        for marker in range(len(self.wand.markers)):
+            mine = np.flatnonzero(label[rows] == marker)
+            theirs = self.rows[b][label[self.rows[b]] == marker]
+            if len(mine) and len(theirs):
+                at = np.searchsorted(t_s[theirs], t_s[rows[mine]] + shift_s)
+                depth |= _lengths(theirs[np.minimum(at, len(theirs) - 1)], points[mine])
+        return depth
+
+
+def _lengths(rows: Index, points: Array) -> dict[int, float]:
+    """Return the distances of points (n, 3) from the origin, by row (n,)."""
+    return dict(zip(rows.tolist(), np.linalg.norm(points, axis=1).tolist(), strict=True))
+
+
+def sampson(E: Array, xy_a: Array, xy_b: Array) -> Array:
+    """Return (n,) Sampson distances of correspondences (n, 2) from the epipolar constraint x_b' E x_a = 0.
+
+    Hartley and Zisserman, section 11.4.3.
+    """
+    a, b = (np.column_stack([xy, np.ones(len(xy))]) for xy in (xy_a, xy_b))
+    line_b, line_a = a @ E.T, b @ E
+    slope = np.concatenate([line_b[:, :2], line_a[:, :2]], axis=1)
+    return np.abs((b * line_b).sum(axis=1)) / np.linalg.norm(slope, axis=1)
+
+
+def intersect_rays(T_a_b: Array, xy_a: Array, xy_b: Array) -> Array:
+    """Triangulate points (n, 3), camera a's frame, from image plane coordinates (n, 2) in two cameras (linear)."""
+    P_a, P_b = np.eye(4)[:3], invert(T_a_b)[:3]
+    homogeneous = cv2.triangulatePoints(P_a, P_b, xy_a.T, xy_b.T).T
+    return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:], float)
+
+
+def find_shift(tracks: Sequence[MarkerTrack], detections: WandDetections, gap_s: float) -> float:
+    """Return how much later the timestamps of camera b are than those of a, seconds; 0 if the data show no shift.
+
+    Args:
+        tracks: of camera b, by marker.
+        detections: of camera a.
+        gap_s: the longest gap over which the tracks are interpolated.
+    """
+    if not len(detections):
+        return 0.0
+    detections = detections.select(spread_evenly(len(detections), SHIFT_SAMPLE))
+    label, t_s, xy = detections.label, detections.t_s, detections.xy
+    coarse = SHIFT_STEP_S * np.arange(
+        -round(MAX_SHIFT_S / SHIFT_STEP_S), round(MAX_SHIFT_S / SHIFT_STEP_S) + 1
+    )
+    misfits = epipolar_misfits(xy, interpolate(tracks, label, t_s + coarse[:, None], gap_s))
+    unshifted = misfits[len(coarse) // 2]
+    best = int(np.nanargmin(misfits)) if np.isfinite(misfits).any() else len(coarse) // 2
+    common = np.isfinite(interpolate(tracks, label, t_s + coarse[best], gap_s)[:, 0])
+    times = len(np.unique(t_s[common]))
+    if times < MIN_TIMES or not supports_shift(unshifted, misfits[best], int(common.sum()), times):
+        return 0.0
+    fine = coarse[best] + SHIFT_STEP_S * np.linspace(-1, 1, 11)
+    misfits = epipolar_misfits(xy, interpolate(tracks, label, t_s + fine[:, None], gap_s))
+    return float(fine[np.nanargmin(misfits)]) if np.isfinite(misfits).any() else float(coarse[best])
+
+
+def spread_evenly(count: int, most: int) -> Index:
+    """Return up to `most` indices below `count`, evenly spaced."""
+    return np.linspace(0, count - 1, min(most, count)).round().astype(np.intp)
+
+
+def supports_shift(unshifted: float, shifted: float, correspondences: int, times: int) -> bool:
+    """Return whether the misfits without and with a shift show that the clocks differ."""
+    return bool(unshifted > shifted * np.exp(EVIDENCE / (min(correspondences, 2 * times) - FITTED)))
+
+
+def epipolar_misfits(xy_a: Array, xy_b: Array) -> Array:
+    """Fit a fundamental matrix to each of S trials of n correspondences; return (S,) median Sampson distances.
+
+    Args:
+        xy_a: (n, 2) image plane coordinates in camera a.
+        xy_b: (S, n, 2) in camera b; NaN without a correspondence. A trial with too few has an infinite misfit.
+    """
+    known = np.isfinite(xy_b[..., 0])
+    b = np.where(known[..., None], xy_b, 0.0)
+    scale_a, scale_b = np.abs(xy_a).mean() + 1e-9, np.abs(b).mean() + 1e-9
+    one = np.ones((*known.shape, 1))
+    ha = np.concatenate([np.broadcast_to(xy_a / scale_a, b.shape), one], axis=2)
+    hb = np.concatenate([b / scale_b, one], axis=2)
+    products = (hb[..., :, None] * ha[..., None, :]).reshape(*known.shape, 9)
+    weight, median = known.astype(float), np.full(len(known), np.inf)
+    for _ in range(REWEIGHTINGS):
+        moments = np.swapaxes(products * weight[..., None], 1, 2) @ products
+        F = np.linalg.eigh(moments)[1][:, :, 0].reshape(-1, 3, 3)
+        off = np.abs(np.einsum("snk,sk->sn", products, F.reshape(-1, 9)))
+        lines_b, lines_a = ha @ np.swapaxes(F, 1, 2), hb @ F
+        slope = (lines_b[..., :2] / scale_b) ** 2, (lines_a[..., :2] / scale_a) ** 2
+        distance = off / np.sqrt(slope[0].sum(axis=2) + slope[1].sum(axis=2) + 1e-18)
+        median = _masked_median(distance, known)
+        weight = known / (1 + (distance / (2 * median[:, None] + 1e-9)) ** 2)
+    return np.where(known.sum(axis=1) >= MIN_COMMON, median, np.inf)
+
+
+def _masked_median(values: Array, known: Mask) -> Array:
+    ordered = np.sort(np.where(known, values, np.inf), axis=1)
+    middle = np.maximum(known.sum(axis=1) - 1, 0) // 2
+    return np.nan_to_num(ordered[np.arange(len(ordered)), middle], posinf=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class InitialRig:
+    """Approximate poses and time offsets of the connected cameras.
+
+    Attributes:
+        poses: (4, 4) T_world_cam by camera index, in an arbitrary world.
+        offset_s: by camera index, true time = timestamp + offset; median 0.
+        metric: whether the scale is known.
+        rejected: inlier ratio by pair of cameras, of the pairs that share enough frame sets but whose relative pose was
+            rejected; 0 where there is none.
+    """
+
+    poses: dict[int, Array]
+    offset_s: dict[int, float]
+    metric: bool
+    rejected: dict[tuple[int, int], float]
+
+    @property
+    def placed(self) -> list[int]:
+        """Indices of the cameras with poses, ascending."""
+        return sorted(self.poses)
+
+
+def build_initial_rig(pairs: TwoViewGeometry, cameras: Sequence[int]) -> InitialRig:
+    """Place the largest connected group of `cameras`."""
+    tree, rejected = _build_spanning_tree(pairs, cameras)
+    poses, offsets = _chain_poses(tree)
+    return InitialRig(poses, offsets, bool(tree) and tree[0].metric, rejected)
+
+
+def _build_spanning_tree(
+    pairs: TwoViewGeometry, cameras: Sequence[int]
+) -> tuple[list[TwoView], dict[tuple[int, int], float]]:
+    """Return the maximum spanning tree (Kruskal) of the largest group of connected cameras, and the rejected pairs.
+
+    The weight of a pair is the number of shared frame sets. A pair is estimated only if it would join two groups.
+    """
+    shared, group, chosen = pairs.count_shared(), {c: frozenset([c]) for c in cameras}, []
+    rejected: dict[tuple[int, int], float] = {}
+    ends = [(a, b) for a in cameras for b in cameras if a < b and shared[a, b] >= MIN_FRAME_SETS // 2]
+    for a, b in sorted(ends, key=lambda ab: (-shared[ab], ab)):
+        if group[a] == group[b]:
+            continue
+        pair = pairs.relate(a, b)
+        if pair is None or pair.inlier_ratio < MIN_INLIER_RATIO:
+            rejected[a, b] = pair.inlier_ratio if pair else 0.0
+            continue
+        chosen.append(pair)
+        group |= dict.fromkeys(group[a] | group[b], group[a] | group[b])
+    if not chosen:
+        return [], rejected
+    largest = max(group.values(), key=lambda g: (len(g), sum(p.inliers for p in chosen if p.a in g), -min(g)))
+    return [pair for pair in chosen if pair.a in largest], rejected
+
+
+def _chain_poses(tree: Sequence[TwoView]) -> tuple[dict[int, Array], dict[int, float]]:
+    """Return poses in the frame of the first pair's camera a, and offsets with median 0.
+
+    A pair of unknown scale takes the scale of the pairs before it, from the depths of their common detections.
+    """
+    if not tree:
+        return {}, {}
+    poses, offsets = {tree[0].a: np.eye(4)}, {tree[0].a: 0.0}
+    depth: dict[int, float] = {}
+    waiting = list(tree)
+    while waiting:
+        pair = next(p for p in waiting if (p.a in poses) != (p.b in poses))
+        waiting.remove(pair)
+        scale = 1.0 if pair.metric else _common_scale(pair, depth)
+        T_a_b = pair.T_a_b.copy()
+        T_a_b[:3, 3] *= scale
+        if pair.a in poses:
+            poses[pair.b], offsets[pair.b] = poses[pair.a] @ T_a_b, offsets[pair.a] - pair.shift_s
+        else:
+            poses[pair.a], offsets[pair.a] = poses[pair.b] @ invert(T_a_b), offsets[pair.b] + pair.shift_s
+        depth |= {row: scale * far for row, far in pair.depth.items()}
+    median = float(np.median(list(offsets.values())))
+    return poses, {camera: offset - median for camera, offset in offsets.items()}
+
+
+def _common_scale(pair: TwoView, depth: dict[int, float]) -> float:
+    ratios = [depth[row] / far for row, far in pair.depth.items() if row in depth]
+    return float(np.median(ratios)) if ratios else 1.0
+
+
+def find_faults(
+    names: Sequence[str], frames: FrameTable, pairs: TwoViewGeometry, placed: Sequence[int]
+) -> dict[str, str]:
+    """Return the fault of each camera that is not placed, and its remedy, by name; only where a fault is found.
+
+    Args:
+        names: of the C cameras.
+        frames: of the recording.
+        pairs: the two-view geometry of the recording.
+        placed: indices of the placed cameras: the others are compared with these, or with all if none is placed.
+    """
+    faults = {}
+    for k in sorted(set(range(len(names))) - set(placed)):
+        others = [j for j in (placed or range(len(names))) if j != k and len(pairs.rows[j])]
+        if others and len(pairs.rows[k]) and (fault := _find_fault(k, others, names, frames, pairs)):
+            faults[names[k]] = fault
+    return faults
+
+
+def _find_fault(
+    k: int, others: Sequence[int], names: Sequence[str], frames: FrameTable, pairs: TwoViewGeometry
+) -> str:
+    """Return the fault of camera k and its remedy; empty if none is found."""
+    if gap_s := _gap_s(frames, k, others):
+        return (
+            f"its frames are {abs(gap_s):.0f} s {_direction(gap_s)} than those of all other cameras; set its clock "
+            "(chrony or NTP) and record again"
+        )
+    other = max(others, key=lambda j: _count_overlapping(frames, pairs, k, j))
+    if _fits(_mirrored(pairs, k), k, other):
+        return f"its image is mirrored against that of '{names[other]}'; disable the flip and record again"
+    if shift_s := _find_large_shift(pairs, k, other):
+        return (
+            f"its timestamps are {abs(shift_s):.2f} s {_direction(shift_s)} than those of '{names[other]}'; set its "
+            "clock (chrony or NTP) and record again"
+        )
+    return ""
+
+
+def _direction(shift_s: float) -> str:
+    return "later" if shift_s > 0 else "earlier"
+
+
+def _gap_s(frames: FrameTable, k: int, others: Sequence[int]) -> float:
+    """Return the time by which camera k recorded after all others, negative if before; 0 below APART_S."""
+    mine, theirs = frames.t_s[frames.camera == k], frames.t_s[np.isin(frames.camera, others)]
+    after, before = float(mine.min() - theirs.max()), float(theirs.min() - mine.max())
+    return after if after > APART_S else -before if before > APART_S else 0.0
+
+
+def _count_overlapping(frames: FrameTable, pairs: TwoViewGeometry, k: int, other: int) -> int:
+    """Count the detections of another camera during the recording of camera k."""
+    mine, t_s = frames.t_s[frames.camera == k], pairs.detections.t_s[pairs.rows[other]]
+    return int(((t_s >= mine.min()) & (t_s <= mine.max())).sum())
+
+
+def _fits(pairs: TwoViewGeometry, k: int, other: int) -> bool:
+    found = pairs.relate(other, k)
+    if found is None or found.inlier_ratio < MIN_FAULT_RATIO:
+        return False
+    return len(np.unique(pairs.detections.t_s[list(found.depth)])) >= MIN_FAULT_FRAMES
+
+
+def _mirrored(pairs: TwoViewGeometry, k: int) -> TwoViewGeometry:
+    """Return the geometry with the image of camera k flipped left to right."""
+    detections, rows, lens = pairs.detections, pairs.rows[k], pairs.lenses[k]
+    uv, xy = detections.uv.copy(), detections.xy.copy()
+    uv[rows, 0] = lens.width - 1 - uv[rows, 0]
+    xy[rows] = lens.normalise(uv[rows])
+    valid = np.flatnonzero(np.isfinite(xy).all(axis=1))
+    return pairs.with_detections(replace(detections, uv=uv, xy=xy).select(valid))
+
+
+def _find_large_shift(pairs: TwoViewGeometry, k: int, other: int) -> float:
+    """Return the shift by which camera k's timestamps are late, if it makes k fit the other camera; else 0."""
+    detections, rows = pairs.detections, pairs.rows[other]
+    rows = rows[spread_evenly(len(rows), FAULT_SAMPLE)]
+    shifts = UNSYNCHRONIZED_STEP_S * np.arange(
+        -round(UNSYNCHRONIZED_S / UNSYNCHRONIZED_STEP_S), round(UNSYNCHRONIZED_S / UNSYNCHRONIZED_STEP_S) + 1
+    )
+    times = detections.t_s[rows] + shifts[:, None]
+    there = interpolate(pairs.tracks[k], detections.label[rows], times, pairs.gap_s)
+    misfits = epipolar_misfits(detections.xy[rows], there)
+    known = np.isfinite(misfits)
+    if not known.any():
+        return 0.0
+    # Few correspondences fit an epipolar geometry by chance: the gain of a shift is weighted by their number.
+    redundancy = np.isfinite(there[known, :, 0]).sum(axis=1) - FITTED
+    gain = redundancy * np.log((np.median(misfits[known]) + MIN_MISFIT) / (misfits[known] + MIN_MISFIT))
+    shift_s = float(shifts[known][gain.argmax()])
+    t_s = detections.t_s.copy()
+    t_s[pairs.rows[k]] -= shift_s
+    return shift_s if _fits(pairs.with_detections(replace(detections, t_s=t_s)), k, other) else 0.0
+
+
+def explain_unplaced(
+    names: Sequence[str], counts: Sequence[int], shared: Index, start: InitialRig
+) -> dict[str, str]:
+    """Return the reason by name for each camera that the initial rig lacks.
+
+    Args:
+        names: of the C cameras.
+        counts: their frames with the wand.
+        shared: (C, C) frame sets that two cameras share.
+        start: the initial rig.
+    """
+    reasons = {}
+    for k in (k for k in range(len(names)) if k not in start.poses):
+        ratios = [ratio for pair, ratio in start.rejected.items() if k in pair]
+        if not counts[k]:
+            reasons[names[k]] = "it never saw the wand; wave the wand in front of it"
+        elif (ratio := max(ratios, default=0.0)) > 0:
+            reasons[names[k]] = (
+                f"its detections fit no other camera (at best {ratio:.0%} of the shared ones are inliers); "
+                "check its name, its clock and its intrinsics"
+            )
+        else:
+            overlap = ", ".join(f"{shared[k, j]} with {name}" for j, name in enumerate(names) if j != k)
+            reasons[names[k]] = (
+                f"frame sets shared with other cameras: {overlap}; at least {MIN_FRAME_SETS} consistent ones are "
+                "needed; wave the wand where its view overlaps theirs"
+            )
+    return reasons
+
+
+def explain_disagreement(names: Sequence[str], pairs: TwoViewGeometry, reasons: dict[str, str]) -> str:
+    """State which pairs of cameras agree by themselves, and what would reconcile the others."""
+    agreeing = []
+    for a, b in combinations(range(len(names)), 2):
+        pair = pairs.relate(a, b)
+        if pair is not None and pair.inlier_ratio >= MIN_INLIER_RATIO:
+            agreeing.append(f"'{names[a]}' and '{names[b]}' ({pair.inlier_ratio:.0%} of their detections)")
+    which = ", ".join(agreeing) if agreeing else "none"
+    return (
+        f"half of the cameras or more contradict each other: {CameraFault(reasons)}. Pairs that agree "
+        f"by themselves: {which}. Record again with cameras and clocks that nothing moves, or leave cameras out"
+    )
+
+
+def explain_failure(
+    names: Sequence[str],
+    counts: Sequence[int],
+    shared: Index,
+    unplaced: dict[str, str],
+    faults: dict[str, str],
+) -> str:
+    """Explain why no two cameras could be placed.
+
+    Args:
+        names: of the C cameras.
+        counts: their frames with the wand.
+        shared: (C, C) frame sets that two cameras share.
+        unplaced: the reason, by name of each camera.
+        faults: of these, what is wrong with a camera itself.
+    """
+    if faults:
+        reasons = "; ".join(f"camera '{name}': {fault}" for name, fault in faults.items())
+        return f"no two cameras could be placed: {reasons}"
+    pairs = np.triu(shared, 1)
+    if not pairs.any():
+        frames = ", ".join(f"{name} {n}" for name, n in zip(names, counts, strict=True))
+        return (
+            f"no two cameras ever saw the wand at once (frames with the wand: {frames}); wave the wand where views "
+            "overlap"
+        )
+    if pairs.max() >= MIN_FRAME_SETS:
+        a, b = divmod(int(pairs.argmax()), len(pairs))
+        return (
+            f"no two cameras could be placed, although '{names[a]}' and '{names[b]}' saw the wand at once "
+            f"{pairs.max()} times: their detections do not fit a wand with these markers; measure the wand, and check "
+            "the intrinsics of the cameras"
+        )
+    reasons = "; ".join(f"camera '{name}': {reason}" for name, reason in unplaced.items())
+    return f"no two cameras could be placed; wave the wand where two cameras see it at once ({reasons})"
