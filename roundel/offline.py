@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from calib.wand.quality.assessment import assess
-from calib.wand.report import WandReport
 
 from calib.errors import CalibrationError
 from calib.intrinsics.board import make_finder
@@ -23,8 +21,9 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
-from calib.wand.quality.grade import RigQuality
+from calib.wand.quality.grade import RigQuality, assess
 from calib.wand.scale import SIGMA_M, Distance
+from calib.wand.wand_report import WandReport
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
