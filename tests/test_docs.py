@@ -20,6 +20,7 @@ from camera_node.commands.camera import JoinArena
 from tests.calib.stick import LENGTH_M, write_stick
 from tests.conftest import ROOT
 from tests.pages import commands, page
+from tests.source_tree import name_of, python_files
 from tests.waiting import wait_for
 from tests.web.roundel.programs import Program, roundel, roundel_command
 
@@ -159,3 +160,51 @@ def test_every_page_is_reached_from_the_overview():
     assert yaml.safe_load(navigation)["strict"] is True
     missing = [name for name in PAGES if f": {name}\n" not in navigation]
     assert missing == []
+
+
+SOURCE_LINK = re.compile(r"\[`(\w+)`\]\(((?:\.\./)*[\w/]+\.(?:py|cpp|hpp))\)")
+DEFINES = r"(?:def|class) {0}\b|\b{0}\([^;]*$"  # in Python; in C++
+
+
+def test_an_idea_is_three_clicks_from_its_line():
+    """README -> architecture -> the file, which defines the function that the link names."""
+    architecture = ROOT / "docs" / "design" / "architecture.md"
+    assert "](docs/design/architecture.md)" in (ROOT / "README.md").read_text()
+    links = SOURCE_LINK.findall(architecture.read_text())
+    assert {"distances_by_principal_axis", "find_candidates", "reprojection_errors"} <= {
+        name for name, _ in links
+    }
+    for name, link in links:
+        path = architecture.parent / link
+        assert path.exists(), f"architecture.md links to {link}, which is not there"
+        assert re.search(DEFINES.format(name), path.read_text(), re.MULTILINE), (
+            f"{link} does not define {name}"
+        )
+
+
+@pytest.mark.parametrize("page_path", ["CONVENTIONS.md", "DECISIONS.md", "docs/design/architecture.md"])
+def test_a_page_names_files_that_exist(page_path: str):
+    """Files may be named without their first folders."""
+    folders = ("calib", "camera_node", "examples", "fusion", "roundel", "tests", "web")
+    known = [
+        f"/{path.relative_to(ROOT).as_posix()}" for name in folders for path in (ROOT / name).rglob("*.*pp")
+    ]
+    known += [f"/{name_of(path)}" for path in python_files(*folders)]
+    text = (ROOT / page_path).read_text()
+    named = set(re.findall(r"`([\w/]+\.(?:py|cpp|hpp))`", text))
+    assert [name for name in sorted(named) if not any(path.endswith(f"/{name}") for path in known)] == []
+    packages = set(re.findall(rf"`((?:{'|'.join(folders)})/[\w/]+)`", text))
+    assert [name for name in sorted(packages) if not (ROOT / name).exists()] == []
+
+
+def test_decisions_are_few_and_have_an_index():
+    """The site's check of anchors tests the links of the index. What refers to a decision names one that exists."""
+    text = (ROOT / "DECISIONS.md").read_text()
+    entries = re.findall(r"^### (\d+)\. (.+)$", text, re.MULTILINE)
+    assert [int(number) for number, _ in entries] == list(range(1, len(entries) + 1))
+    assert len(entries) <= 60
+    assert [title for number, title in entries if f"[{number}. {title}](#" not in text] == []
+    folders = ("calib", "camera_node", "docs", "fusion", "roundel", "tests", "web")
+    files = [*python_files(*folders), *(ROOT / "docs").rglob("*.md")]
+    named = {int(n) for path in files for n in re.findall(r"DECISIONS (\d+)", path.read_text())}
+    assert named <= {int(number) for number, _ in entries}
