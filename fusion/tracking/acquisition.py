@@ -14,21 +14,20 @@ from fusion._core import SLACK_PX
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, mean_by_body
 from fusion.model.robots import Robot
 from fusion.model.states import States
+from fusion.tracking.constellation_search import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import MAX_CHI2
-from fusion.tracking.grouping.marker_search import MarkerSearch
-from fusion.tracking.grouping.multiview import Marker
-from fusion.tracking.identity.confirmation import WeakFits
-from fusion.tracking.identity.constellation import MIN_MARKERS, TriangulatedMarkers, search
-from fusion.tracking.identity.identification import Identified, Question, RefinedFits, identify
-from fusion.tracking.identity.single_markers import (
+from fusion.tracking.identification import Identified, MissingConstellations, RefinedFits, WeakFits, identify
+from fusion.tracking.marker_search import MarkerSearch
+from fusion.tracking.normals import start_rotation
+from fusion.tracking.rays import Marker
+from fusion.tracking.single_markers import (
     Histories,
     MarkerChoice,
     choose_markers,
 )
-from fusion.tracking.identity.trial_updates import Starts, refine
-from fusion.tracking.normals import start_rotation
 from fusion.tracking.track_table import TrackTable
+from fusion.tracking.trial_updates import Starts, refine
 
 MAX_BODIES = 300  # constellations searched for in one frame set; the others follow in the next ones
 
@@ -143,7 +142,7 @@ class Acquisition:
         rows = np.roll(missing, -int(np.searchsorted(missing, turn)))[:MAX_BODIES]
         robots = {row: table.robots[row] for row in rows.tolist()}
         scene = TriangulatedMarkers.of(markers, self._cameras)
-        question = Question(robots, scene, search(robots, scene))
+        question = MissingConstellations(robots, scene, search(robots, scene))
         identified = identify(
             question,
             lambda fits: self._refine(table, Starts.of(fits, markers, table.markers), detections),
@@ -203,7 +202,7 @@ def _too_few(robot: Robot, scene: TriangulatedMarkers) -> str:
     return f"declared with discs of {declared_mm:.0f} mm, but unlabeled ones measure {seen_mm:.0f} mm"
 
 
-def _reason(table: TrackTable, k: int, question: Question, identified: Identified) -> str:
+def _reason(table: TrackTable, k: int, question: MissingConstellations, identified: Identified) -> str:
     """Why constellation k was not acquired."""
     n, found = len(table.robots[k].markers), question.candidates
     if k not in question.robots:

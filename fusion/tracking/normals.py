@@ -11,7 +11,7 @@ from camera_node.geometry.sphere import fibonacci_sphere
 from fusion import _core
 from fusion.model.observations import CameraArray, DetectionTable
 from fusion.tracking.gating import AXIS_SIGMA_PX, DECISIVE_CHI2
-from fusion.tracking.grouping.multiview import Marker
+from fusion.tracking.rays import Marker
 
 DIRECTIONS = 600  # tested on the sphere, about 9 degrees apart; the estimator refines the best one
 SAME_NORMAL = np.cos(np.radians(40))  # cosine above which two directions count as one solution

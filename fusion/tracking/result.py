@@ -16,7 +16,7 @@ from fusion.model.observations import Assignments, CameraArray, DetectionTable, 
 from fusion.model.states import POSITION, States
 from fusion.protocol.pose_messages import Latency, Markers, RobotPose
 from fusion.tracking.estimator import Prediction
-from fusion.tracking.grouping.multiview import Marker
+from fusion.tracking.rays import Marker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers
 

@@ -15,7 +15,7 @@ from camera_node.detection.disc_pose import decompose
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.observations import CameraArray, DetectionTable
 from fusion.tracking.gating import AXIS_SIGMA_PX, FORGET_NS, MAX_SPEED_M_S, POSITION_GATE
-from fusion.tracking.grouping.multiview import Marker
+from fusion.tracking.rays import Marker
 from fusion.tracking.unlabeled import UnlabeledMarkers
 
 CONFIRMED = 3  # frame sets with a detection near its last position

@@ -20,10 +20,9 @@ from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
 from fusion.protocol.pose_messages import RobotPose
 from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
-from fusion.tracking.association import AssociatedFrames, Association
+from fusion.tracking.association import AssociatedFrames, Association, OwnDetections
 from fusion.tracking.estimator import Estimator, Prediction
-from fusion.tracking.grouping.multiview import Marker
-from fusion.tracking.identity.own_detections import OwnDetections
+from fusion.tracking.rays import Marker
 from fusion.tracking.result import (
     FilterStep,
     ObservationSummary,

@@ -3,6 +3,8 @@
 
 Grouping triangulates a marker from rays of different times, with a covariance for any speed up to `MAX_SPEED_M_S`.
 The estimator for robots then estimates velocity and normal with the position.
+
+Markers belong to one body if their distance stays the same while they move (`CommonMotion`).
 """
 
 from collections.abc import Sequence
@@ -12,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from fusion.model.likeness import distances
 from fusion.model.observations import CameraArray, DetectionTable, Discs, MatchedObservations, mean_by_body
 from fusion.model.robots import MOTIONS
 from fusion.model.states import POSITION, States, reset_unobservable
-from fusion.tracking.company import Company
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import (
     ANY_DIAMETERS,
@@ -25,8 +27,107 @@ from fusion.tracking.gating import (
     POSITION_GATE,
     START_SIGMAS_SINGLE,
 )
-from fusion.tracking.grouping.multiview import Marker
 from fusion.tracking.normals import start_rotation
+from fusion.tracking.rays import Marker
+
+MOVED_M = 0.05  # since the anchor: far above the noise
+CONCLUSIVE_M = (
+    0.15  # two markers that moved so far together belong to one body, also after one of them is hidden
+)
+RIGID_M = 0.01  # largest change of the distance of two markers of one body
+BODY_M = 1.0  # largest distance of two markers of one body
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonMotion:
+    """What the motion of K markers says about the bodies that they belong to.
+
+    Positions are compared with anchors, positions of one time not long ago. Each frame set that sees both markers of a
+    pair, one of which has moved, votes for or against one body: at single times, the distance of two robots that pass
+    each other is the same as at the anchor.
+
+    Attributes:
+        anchor: (K, 3) NaN for markers that are younger.
+        votes: (K, K) for one body less those against it, since the anchor.
+        rigid_m: (K, K) how far a pair has moved as one body, 0 as soon as the votes contradict it.
+        belonged: (K,) to a body whose other marker was lost from view.
+        moved: (K,) since the anchor, as of the last observation.
+    """
+
+    anchor: Array
+    votes: NDArray[np.int64]
+    rigid_m: Array
+    belonged: Mask
+    moved: Mask
+
+    @classmethod
+    def unknown(cls, n: int) -> "CommonMotion":
+        """Of n new markers."""
+        pairs, never = np.zeros((n, n)), np.zeros(n, bool)
+        return cls(np.full((n, 3), np.nan), pairs.astype(np.int64), pairs, never, never)
+
+    @property
+    def anchored(self) -> Mask:
+        """(K,) whose motion can be compared."""
+        return np.isfinite(self.anchor[:, 0])
+
+    @property
+    def moves_with_others(self) -> Mask:
+        """(K,) markers that moved together with another one."""
+        return self.belonged | (self.rigid_m > 0).any(1)
+
+    @property
+    def alone(self) -> Mask:
+        """(K,) markers that moved, none of the others with them."""
+        return self.moved & ~self.moves_with_others
+
+    def select(self, rows: NDArray) -> "CommonMotion":
+        """Of some of the markers, indices; the bodies of the others are remembered."""
+        gone = np.ones(len(self.anchor), bool)
+        gone[rows] = False
+        belonged = self.belonged | (self.rigid_m[:, gone] > CONCLUSIVE_M).any(1)
+        pairs = np.ix_(rows, rows)
+        return CommonMotion(
+            self.anchor[rows], self.votes[pairs], self.rigid_m[pairs], belonged[rows], self.moved[rows]
+        )
+
+    def with_new(self, n: int) -> "CommonMotion":
+        """Of these markers, then n new ones."""
+        new = CommonMotion.unknown(n)
+        return CommonMotion(
+            np.concatenate([self.anchor, new.anchor]),
+            np.pad(self.votes, (0, n)),
+            np.pad(self.rigid_m, (0, n)),
+            np.concatenate([self.belonged, new.belonged]),
+            np.concatenate([self.moved, new.moved]),
+        )
+
+    def observed(self, p: Array, radius: Array, seen: Mask) -> "CommonMotion":
+        """With the votes of a frame set.
+
+        Args:
+            p: (K, 3) positions, world frame, m.
+            radius: (K,) of the markers, m. Two that overlap are one disc that was triangulated twice.
+            seen: (K,) in this frame set.
+        """
+        motion = np.nan_to_num(np.linalg.norm(p - self.anchor, axis=1))
+        moved = seen & (motion > MOVED_M)
+        if not moved.any():
+            return replace(self, moved=moved)
+        now = distances(p)
+        overlap = now < radius[:, None] + radius
+        known = seen & self.anchored
+        compared = known[:, None] & known & (moved[:, None] | moved) & ~overlap
+        is_rigid = (np.abs(now - distances(self.anchor)) < RIGID_M) & (now < BODY_M)
+        votes = self.votes + np.where(compared, np.where(is_rigid, 1, -1), 0)
+        pair_m = np.maximum(self.rigid_m, np.maximum(motion[:, None], motion))
+        rigid_m = np.where(compared & (votes > 0), pair_m, np.where(votes < 0, 0.0, self.rigid_m))
+        return replace(self, votes=votes, rigid_m=rigid_m, moved=moved)
+
+    def anchored_at(self, p: Array) -> "CommonMotion":
+        """With new anchors, the positions p (K, 3)."""
+        return replace(self, anchor=p, votes=np.zeros_like(self.votes), moved=np.zeros(len(p), bool))
+
 
 MAX_TRACKS = 64  # markers with a velocity and a normal; false detections make hundreds of markers
 MAX_STARTS = 8  # tracks that begin in one frame set; a start costs a millisecond
@@ -80,7 +181,7 @@ class MarkerHistories:
 
     age_s: Array
     anchored: Mask
-    in_company: Mask
+    moves_with_others: Mask
     alone: Mask
 
 
@@ -101,7 +202,7 @@ class _Tracks:
     has_normal: Mask
     seen_ns: NDArray[np.int64]
     since_ns: NDArray[np.int64]
-    company: Company
+    company: CommonMotion
 
     def __len__(self) -> int:
         return len(self.states)
@@ -132,7 +233,7 @@ class _Tracks:
     def none(cls) -> "_Tracks":
         states = States.at_rest(np.empty((0, 3, 3)), np.empty((0, 3)), START_SIGMAS_SINGLE)
         times = np.empty(0, np.int64)
-        return cls(states, np.empty(0), np.empty(0, bool), times, times, Company.unknown(0))
+        return cls(states, np.empty(0), np.empty(0, bool), times, times, CommonMotion.unknown(0))
 
     def updated(self, rows: Index, states: States, t_ns: int) -> "_Tracks":
         """With new states of the tracks that were seen."""
@@ -194,12 +295,15 @@ class UnlabeledTracker:
         covariance = np.array([marker.covariance for marker in markers]).reshape(-1, 3, 3)
         pair = _pair(tracks.states, position, covariance)
         paired, known = np.flatnonzero(pair >= 0), pair[pair >= 0]
-        age_s, (anchored, in_company, alone) = np.zeros(len(pair)), np.zeros((3, len(pair)), bool)
+        age_s, (anchored, moves_with_others, alone) = np.zeros(len(pair)), np.zeros((3, len(pair)), bool)
         age_s[paired] = (t_ns - tracks.since_ns[known]) * 1e-9
         company = tracks.company
-        anchored[paired], in_company[paired] = company.anchored[known], company.in_company[known]
+        anchored[paired], moves_with_others[paired] = (
+            company.anchored[known],
+            company.moves_with_others[known],
+        )
         alone[paired] = company.alone[known]
-        return MarkerHistories(age_s, anchored, in_company, alone)
+        return MarkerHistories(age_s, anchored, moves_with_others, alone)
 
     def _predict(self, t_ns: int) -> _Tracks:
         tracks = self._tracks.select(t_ns - self._tracks.seen_ns < FORGET_NS)

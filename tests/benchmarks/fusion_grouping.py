@@ -19,7 +19,8 @@ from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray, DetectionTable
 from fusion.model.robots import Robot
-from fusion.tracking.grouping.multiview import Marker, find_markers
+from fusion.tracking.marker_search import find_markers
+from fusion.tracking.rays import Marker
 from tests.benchmarks.fusion_load import DIAMETER_M, DISTORTION, LENS, Load
 from tests.fusion.synthetic import START_NS, Arena, line, ring
 

@@ -8,7 +8,7 @@ import numpy as np
 from camera_node.protocol.messages import encode
 from fusion.model.frames import FrameSet
 from fusion.server.server import collecting_between_frame_sets
-from fusion.tracking.grouping.portions import limit_of
+from fusion.tracking.marker_search import limit_of
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_capacity import DELAY_NS, START_S, Queue
 from tests.benchmarks.fusion_load import Load

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fusion.tracking.grouping.two_views import _marginals
+from fusion.tracking.ray_pairs import _marginals
 from tests.benchmarks.fusion_grouping import (
     FREE_RUNNING,
     SCENES,

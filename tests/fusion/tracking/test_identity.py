@@ -15,12 +15,10 @@ from fusion.model.limits import Limits
 from fusion.model.observations import CameraArray, DetectionTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking import acquisition
+from fusion.tracking import acquisition, identification, marker_search
+from fusion.tracking.constellation_search import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
 from fusion.tracking.gating import POSITION_GATE
-from fusion.tracking.grouping import marker_search
-from fusion.tracking.grouping.multiview import find_markers
-from fusion.tracking.identity import identification
-from fusion.tracking.identity.constellation import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
+from fusion.tracking.marker_search import find_markers
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.faults.arena import small_load
 from tests.benchmarks.fusion_accuracy import accuracy, frame_sets

@@ -13,7 +13,7 @@ import numpy as np
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.states import POSITION
 from fusion.tracking.gating import DIAMETER_TOLERANCE, POSITION_GATE
-from fusion.tracking.grouping.multiview import Marker
+from fusion.tracking.rays import Marker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import MarkerHistories
 
@@ -66,7 +66,7 @@ def _reach(table: TrackTable, missing: Index, markers: list[Marker], history: Ma
     sized = [[_has_size(table, k, marker) for marker in markers] for k in missing.tolist()]
     near = [[_is_near(table, k, marker) for marker in markers] for k in missing.tolist()]
     sized, near = np.array(sized, bool).reshape(shape), np.array(near, bool).reshape(shape)
-    within = sized & near & ~history.in_company
+    within = sized & near & ~history.moves_with_others
     alone = within & history.alone
     is_known = (alone.sum(1) == 1) & ~(within & ~history.anchored).any(1)
     return _Reach(sized, near, np.where(is_known[:, None], alone, within))

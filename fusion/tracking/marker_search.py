@@ -14,11 +14,14 @@
 The result is one grouping over all cameras, in which each detection belongs to one marker at most. A ray that fits two
 markers equally well joins neither. Free-running cameras see a moving marker at different positions, so the gates grow
 with the time between frames.
+
+`MarkerSearch` gives it the unassigned detections of a frame set: with the declared sizes, now and then with others. Of
+crowded frames it searches the detections around one of them, another one in each turn.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import isfinite
+from math import isfinite, sqrt
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -27,38 +30,26 @@ from scipy.spatial import KDTree
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.observations import CameraArray, DetectionTable
-from fusion.tracking.grouping.motion import (
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
+from fusion.tracking.gating import ANY_DIAMETERS, DIAMETER_TOLERANCE
+from fusion.tracking.ray_pairs import misfit_of, pair_rays
+from fusion.tracking.rays import (
+    Marker,
+    Rays,
     diameters_of,
     frames_of,
     has_usual_size,
     join_moving,
+    misses,
+    misses_of_all,
+    rays_of,
     triangulate,
 )
-from fusion.tracking.grouping.rays import Rays, misses, misses_of_all, rays_of
-from fusion.tracking.grouping.two_views import misfit_of, pair_rays
 
 CLEARLY = 0.5  # largest ratio of a ray's distances to the closest and the second closest marker
 BLOCK = 64  # rays compared with all markers at a time: the distances stay in the cache
 MOVING_ROUNDS = 2  # in which groups of a usual size claim their rays before the others
 JOIN_ROUNDS = 2  # of refinement before ambiguous rays are reassigned
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Marker:
-    """A triangulated marker.
-
-    Attributes:
-        position, covariance: (3,) and (3, 3), world frame.
-        detections, cameras: rows of its detections, and the index of the camera of each.
-        diameter_m: median of its views; NaN where unknown.
-    """
-
-    position: Array
-    covariance: Array
-    detections: Index
-    cameras: Index
-    diameter_m: float
 
 
 def find_markers(
@@ -242,3 +233,123 @@ def _markers(rays: Rays, group: Index, centres: Array, rows: Index) -> list[Mark
 def _median(sizes: Array) -> float:
     known = sorted(size for size in sizes.tolist() if isfinite(size))
     return known[len(known) // 2] if known else np.nan
+
+
+MIN_LIMIT = 10  # detections of a frame in a portion: those of two robots
+
+
+@dataclass(frozen=True, slots=True)
+class Portion:
+    """Of frames with more than `limit` detections, those nearest to one point; another one in each turn.
+
+    The point is on the ray of a detection of such a frame, at the range of a marker of `diameter_m`.
+    """
+
+    limit: int
+    turn: int
+    diameter_m: float
+
+
+def limit_of(n_frames: int, max_pairs: int) -> int:
+    """Detections of each of `n_frames` frames, such that those of different frames make at most `max_pairs` pairs."""
+    return max(MIN_LIMIT, int(sqrt(2 * max_pairs / max(1, n_frames * (n_frames - 1)))))
+
+
+def portion_of(
+    cameras: CameraArray, detections: DetectionTable, rows: Index, portion: Portion
+) -> tuple[Index, Index]:
+    """The rows of this portion, all rows of frames below the limit; and the cameras of the frames above it."""
+    limit, diameter_m = portion.limit, portion.diameter_m
+    rows = rows[np.isfinite(detections.xy[0, rows])]
+    count = np.bincount(detections.frame[rows], minlength=len(detections.exposures.camera))
+    above = np.flatnonzero(count > limit)
+    crowded = np.unique(detections.exposures.camera[above])
+    if not len(above):
+        return rows, crowded
+    rays = rays_of(cameras, detections, rows, np.array([diameter_m]))
+    seeds = np.flatnonzero(np.isin(rays.frame, above) & np.isfinite(rays.size))
+    if not len(seeds):
+        return rows[~np.isin(rays.frame, above)], crowded
+    seed = seeds[np.random.default_rng(portion.turn).integers(len(seeds))]
+    to = rays.o[seed] + rays.d[seed] * diameter_m / rays.size[seed] - rays.o
+    off = -np.einsum("ni,ni->n", rays.d, to / np.linalg.norm(to, axis=1, keepdims=True))
+    rank = np.empty(len(rows), np.intp)
+    order = np.lexsort((off, rays.frame))
+    rank[order] = np.arange(len(rows)) - np.concatenate([[0], np.cumsum(count)])[rays.frame[order]]
+    return rows[rank < limit], crowded
+
+
+# Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
+# more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
+MAX_PAIRS = 80_000
+# The same of detections that no declared size explains, above which other sizes are not searched for: a new robot is
+# defined where little else is unassigned, and poses must not wait for it. That is 25 in each frame of 8 cameras.
+MAX_OTHER_PAIRS = 20_000
+OTHERS_EVERY = 8  # frame sets from one search for other sizes to the next, while none is found
+
+
+class MarkerSearch:
+    """Triangulates markers from unassigned detections.
+
+    Args:
+        cameras: cameras of the rig.
+        leads: whether this shard reports markers that no robot declares.
+
+    Attributes:
+        n_frame_sets: with unassigned detections, so far.
+    """
+
+    def __init__(self, cameras: CameraArray, leads: bool) -> None:
+        self._cameras, self._leads = cameras, leads
+        self.n_frame_sets = 0
+        self._has_others = False  # whether the last search for other sizes found markers
+
+    def find(
+        self, declared: MarkerTable, n_missing: int, detections: DetectionTable, assignments: Assignments
+    ) -> tuple[list[Marker], Index]:
+        """Triangulate markers from unassigned detections; and the cameras that have too many of these.
+
+        With part of the detections, a robot can be taken for another one whose markers are not in this part. So all are
+        searched that the markers of missing robots can explain.
+
+        Args:
+            declared: the markers of all robots.
+            n_missing: how many markers untracked robots have.
+            detections: of a frame set.
+            assignments: of the tracked robots.
+        """
+        free = np.ones(len(detections), bool)
+        free[assignments.detection] = False
+        diameters = np.unique(2 * declared.radius) if len(declared) else np.array(ANY_DIAMETERS)
+        if not free.any():
+            return [], free.nonzero()[0][:0]
+        self.n_frame_sets += 1
+        limit = n_missing + limit_of(len(detections.exposures.camera), MAX_PAIRS)
+        portion = Portion(limit, self.n_frame_sets, float(np.median(diameters)))
+        rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
+        markers = find_markers(self._cameras, detections, rows, diameters)
+        if self._leads and len(declared) and (self._has_others or self.n_frame_sets % OTHERS_EVERY == 0):
+            others = self._find_other_sizes(detections, rows, markers, diameters)
+            self._has_others = len(others) > 0
+            markers += others
+        return markers, crowded
+
+    def _find_other_sizes(
+        self, detections: DetectionTable, rows: Index, markers: list[Marker], diameters: Array
+    ) -> list[Marker]:
+        """Triangulate markers that no robot declares: a new robot may have another diameter.
+
+        Args:
+            detections: of a frame set.
+            rows: that were searched.
+            markers: that were found, of the declared `diameters`.
+        """
+        rest = np.setdiff1d(rows, np.concatenate([rows[:0], *(marker.detections for marker in markers)]))
+        rest = rest[np.isfinite(detections.axes_px[0, rest])]
+        count = np.bincount(detections.frame[rest])
+        if not 0 < (count.sum() ** 2 - (count**2).sum()) // 2 <= MAX_OTHER_PAIRS:
+            return []
+        others = find_markers(self._cameras, detections, rest, np.array(ANY_DIAMETERS))
+        size = np.array([marker.diameter_m for marker in others])
+        is_other = np.all(np.abs(size[:, None] / diameters - 1) > DIAMETER_TOLERANCE, axis=1)
+        return [others[k] for k in np.flatnonzero(is_other)]

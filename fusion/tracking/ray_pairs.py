@@ -16,8 +16,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
 from fusion import _core
-from fusion.tracking.grouping.motion import triangulate
-from fusion.tracking.grouping.rays import SIGMAS, Rays, misses
+from fusion.tracking.rays import SIGMAS, Rays, misses, triangulate
 
 PROBABLE = 0.9
 FAR = 5.0  # tolerances: within, but beyond one tolerance, rays pass each other by chance

@@ -13,7 +13,7 @@ from fusion.model.likeness import MIN_MARKERS, distances
 from fusion.model.observations import CameraArray
 from fusion.model.robots import Robot
 from fusion.tracking.gating import DIAMETER_TOLERANCE
-from fusion.tracking.grouping.multiview import Marker
+from fusion.tracking.rays import Marker
 
 SIGMAS = 3.0
 SLACK_M = 0.004  # of a distance: markers are glued on by hand

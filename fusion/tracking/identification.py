@@ -18,6 +18,10 @@ a fit is refused unless the cameras detect most of the other markers that they s
 almost all of them.
 
 All limits delay: what one frame set leaves undecided, the next ones decide. The robots take turns.
+
+Weak fits are confirmed in several frame sets. Markers of another body fit a constellation by an invented velocity of
+about 1 m/s, which moves them by the centimetres that they are off between the exposures of free-running cameras. Such
+fits stay where they are although they have a velocity.
 """
 
 from collections.abc import Callable
@@ -28,9 +32,8 @@ import numpy as np
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.observations import Assignments
 from fusion.model.robots import Robot
-from fusion.model.states import States
-from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2
-from fusion.tracking.identity.constellation import (
+from fusion.model.states import VELOCITY, States
+from fusion.tracking.constellation_search import (
     MIN_MARKERS,
     Candidates,
     Fits,
@@ -38,10 +41,13 @@ from fusion.tracking.identity.constellation import (
     TriangulatedMarkers,
     fit,
 )
-from fusion.tracking.identity.verification import EVIDENT, MIN_EXPLAINED
+from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2, POSITION_GATE
 
 POOR = 10.0  # times the usual squared residual, above which a fit is poor
 STRONG_DETECTIONS = 8  # of three markers: they overdetermine a pose by ten
+# Shares of the expected views that are detected. A true fit has 1 where nothing covers the robot, one with a wrong
+# marker up to 0.67, and a false one up to 0.5.
+MIN_EXPLAINED, EVIDENT = 0.6, 0.8
 MAX_COMPARED = 1_000  # mappings in one frame set, all rivals of some robots; more wait for their turn
 MAX_RIVALS = (
     3_000  # mappings that compete with those of one robot; with more it waits until others are acquired
@@ -115,7 +121,7 @@ class Identified:
     turn: int
 
 
-class _Claims:
+class _InUse:
     """Robots and points of fits."""
 
     def __init__(self, n_robots: int, n_points: int) -> None:
@@ -131,7 +137,7 @@ class _Claims:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Level:
+class _ComparedFits:
     """K fits with one number of markers, refined; chi-square and robot (K,) of the best rival of each."""
 
     fits: Fits
@@ -144,11 +150,13 @@ class _Level:
         """(K,) fits that are clearly better than all rivals."""
         return self.refined.chi2 + DECISIVE_CHI2 <= self.best
 
-    def select(self, rows: Mask) -> "_Level":
-        return _Level(self.fits.select(rows), self.refined.select(rows), self.best[rows], self.rival[rows])
+    def select(self, rows: Mask) -> "_ComparedFits":
+        return _ComparedFits(
+            self.fits.select(rows), self.refined.select(rows), self.best[rows], self.rival[rows]
+        )
 
 
-def identify(question: "Question", refine: Refine, usual: float, turn: int) -> Identified:
+def identify(question: "MissingConstellations", refine: Refine, usual: float, turn: int) -> Identified:
     """Accept fits, those with most markers first.
 
     Args:
@@ -167,7 +175,7 @@ def identify(question: "Question", refine: Refine, usual: float, turn: int) -> I
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Question:
+class MissingConstellations:
     """Missing constellations by row, the unassigned markers, and what the search found for these."""
 
     robots: dict[int, Robot]
@@ -178,11 +186,11 @@ class Question:
 class _Decisions:
     """The decisions about the fits of a frame set, from those with most markers to those with fewest."""
 
-    def __init__(self, question: Question, usual: float, turn: int) -> None:
+    def __init__(self, question: MissingConstellations, usual: float, turn: int) -> None:
         size = max(question.robots, default=-1) + 1, len(question.scene)
         self._question, self._usual = question, usual
-        self._accepted, self._open, self._open_good = _Claims(*size), _Claims(*size), _Claims(*size)
-        self._poor: list[_Level] = []
+        self._accepted, self._open, self._open_good = _InUse(*size), _InUse(*size), _InUse(*size)
+        self._poor: list[_ComparedFits] = []
         self.fits: list[RefinedFits] = []
         self.weak: list[RefinedFits] = []
         self.rivals: dict[int, int] = {}
@@ -214,7 +222,7 @@ class _Decisions:
             is_free = ~self._open_good.touch(mappings) & ~self._accepted.touch(mappings)
             self.weak.append(level.refined.select(self._has_all(mappings) & is_free & level.wins))
 
-    def _compare(self, mappings: Mappings, refine: Refine) -> _Level:
+    def _compare(self, mappings: Mappings, refine: Refine) -> _ComparedFits:
         """Refine mappings and compare those that the detections allow."""
         fits = fit(mappings, self._question.robots, self._question.scene)
         refined = refine(fits)
@@ -222,9 +230,9 @@ class _Decisions:
         self.unexplained.update(refined.robot[is_plausible & is_refused].tolist())
         is_plausible &= ~is_refused
         fits, refined = fits.select(is_plausible), refined.select(is_plausible)
-        return _Level(fits, refined, *_best_rivals(fits.mappings, refined.chi2))
+        return _ComparedFits(fits, refined, *_best_rivals(fits.mappings, refined.chi2))
 
-    def _is_evident(self, level: _Level) -> Mask:
+    def _is_evident(self, level: _ComparedFits) -> Mask:
         """(K,) fits with more than three markers, or with all three of a robot and enough detections in common frames.
 
         Of a robot with several sides, those whose expected views are detected.
@@ -242,7 +250,7 @@ class _Decisions:
         sizes = [len(self._question.robots[k].markers) for k in mappings.robot.tolist()]
         return np.array(sizes, np.intp) == mappings.points.shape[1]
 
-    def _accept(self, level: _Level, rows: Mask) -> None:
+    def _accept(self, level: _ComparedFits, rows: Mask) -> None:
         self._accepted.add(level.fits.mappings.select(rows))
         is_strong = level.refined.is_expected | self._is_evident(level)
         self.fits.append(level.refined.select(rows & is_strong))
@@ -259,7 +267,7 @@ def _portion(mappings: Mappings, turn: int) -> tuple[Mask, Index, int]:
         return np.ones(len(mappings), bool), robots, turn
     compared, decided = np.zeros(len(mappings), bool), []
     for robot in np.roll(robots, -int(np.searchsorted(robots, turn))).tolist():
-        claim = _Claims(int(robots.max()) + 1, int(mappings.points.max()) + 1)
+        claim = _InUse(int(robots.max()) + 1, int(mappings.points.max()) + 1)
         claim.add(mappings.select(mappings.robot == robot))
         rivals = claim.touch(mappings)
         if rivals.sum() > MAX_RIVALS:
@@ -282,3 +290,77 @@ def _best_rivals(mappings: Mappings, chi2: Array) -> tuple[Array, Index]:
     others = np.where(exclusive, chi2, np.inf)
     rival = others.argmin(1)
     return others[np.arange(len(chi2)), rival], mappings.robot[rival]
+
+
+CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
+MAX_BETWEEN = 5  # frame sets from one to the next of these
+SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
+SLACK_M_S = 0.15  # of a velocity, beyond its covariance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sighting:
+    """The last weak fit of a robot.
+
+    Attributes:
+        p: (3,) its position.
+        t_ns, frame_set: when it was.
+        count: how many were at one place so far.
+        drift: (3,) how far these moved, less what their velocities say.
+        since_ns: the time of the first of these.
+        cov_v: (3, 3) covariance of the last velocity; the same cameras make the same error in each frame set.
+    """
+
+    p: Array
+    t_ns: int
+    frame_set: int
+    count: int
+    drift: Array
+    since_ns: int
+    cov_v: Array
+
+    @classmethod
+    def of(cls, fit: States, t_ns: int, frame_set: int, last: "_Sighting | None") -> "_Sighting":
+        """The sighting of one fit, after the last one."""
+        p, v, cov_v = fit.p[0], fit.v[0], fit.P[0, VELOCITY, VELOCITY]
+        first = cls(p, t_ns, frame_set, 1, np.zeros(3), t_ns, cov_v)
+        if last is None:
+            return first
+        moved = p - last.p
+        if np.linalg.norm(moved) > SAME_PLACE_M * max(1, frame_set - last.frame_set):
+            return first
+        drift = last.drift + moved - (t_ns - last.t_ns) * 1e-9 * v
+        return cls(p, t_ns, frame_set, last.count + 1, drift, last.since_ns, cov_v)
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether enough fits were at one place, and moved as their velocities say."""
+        if self.count < CONFIRMATIONS or self.t_ns <= self.since_ns:
+            return False
+        off = self.drift / ((self.t_ns - self.since_ns) * 1e-9)
+        return bool(off @ np.linalg.solve(self.cov_v + SLACK_M_S**2 * np.eye(3), off) < POSITION_GATE)
+
+
+class WeakFits:
+    """The last weak fit of each robot."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, _Sighting] = {}
+
+    def confirm(self, weak: list[RefinedFits], t_ns: int, frame_set: int) -> list[RefinedFits]:
+        """Of the weak fits of a frame set, those that were at one place in `CONFIRMATIONS`, and nowhere else between.
+
+        Args:
+            weak: at most one of each robot.
+            t_ns: time of the frame set.
+            frame_set: its number.
+        """
+        self._last = {k: seen for k, seen in self._last.items() if frame_set - seen.frame_set <= MAX_BETWEEN}
+        for fits in weak:
+            for k, robot in enumerate(fits.robot.tolist()):
+                state, last = fits.states.select(np.array([k])), self._last.get(robot)
+                self._last[robot] = _Sighting.of(state, t_ns, frame_set, last)
+        return [
+            fits.select(np.array([self._last[k].is_confirmed for k in fits.robot.tolist()], bool))
+            for fits in weak
+        ]

@@ -1,25 +1,44 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Verifies the fit of a body with markers on several sides by all its views.
+"""Trial updates: how well detections fit a robot at a possible start, each start independent of the others.
 
 Such a body has so many distances that three or four markers fit some of them by chance, in particular while it moves
 and free-running cameras triangulate it with errors of centimetres. But a true fit also predicts where each camera sees
 the other markers, including those that no second camera sees.
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.observations import Assignments, CameraArray, DetectionTable, Discs, MarkerTable, Views
+from fusion.model.observations import (
+    Assignments,
+    CameraArray,
+    DetectionTable,
+    Discs,
+    MarkerTable,
+    MatchedObservations,
+    Views,
+    mean_by_body,
+)
 from fusion.model.states import States
 from fusion.tracking.association import assign
+from fusion.tracking.constellation_search import Fits
+from fusion.tracking.estimator import Estimator
+from fusion.tracking.gating import (
+    POSITION_GATE,
+    START_S,
+    START_SIGMAS,
+    START_SIGMAS_SINGLE,
+)
+from fusion.tracking.identification import RefinedFits
+from fusion.tracking.rays import Marker
+from fusion.tracking.single_markers import history_chi2, is_local
+from fusion.tracking.track_table import TrackTable
 
 MIN_FACING, MARGIN_PX = 0.35, 30.0  # of markers that a camera is certain to see
 MIN_VIEWS = 8  # expected ones, from which a share is evidence
-# Shares of the expected views that are detected. A true fit has 1 where nothing covers the robot, one with a wrong
-# marker up to 0.67, and a false one up to 0.5.
-MIN_EXPLAINED, EVIDENT = 0.6, 0.8
 
 
 def explained_share(
@@ -101,3 +120,79 @@ def _different(numbers: Index, body: Index, n: int) -> Index:
     """(n,) how many different numbers each fit has."""
     pairs = np.unique(np.column_stack([body, numbers]), axis=0)
     return np.asarray(np.bincount(pairs[:, 0], minlength=n), np.intp)
+
+
+SMALL = 1e-3  # rad and m; a larger correction of a start is followed by another linearization
+FAR_CHI2 = 50.0  # bound of a constellation's history: it may have been carried elsewhere
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Starts:
+    """K robots (rows) at rest, the assignments that support them, and the start of each assignment."""
+
+    robot: Index
+    states: States
+    assignments: Assignments
+    body: Index
+
+    @classmethod
+    def of(cls, fits: Fits, markers: list[Marker], table: MarkerTable) -> "Starts":
+        """Constellations where the distances between their markers and triangulated markers agree."""
+        mappings = fits.mappings
+        rows = table.first[mappings.robot][:, None] + mappings.numbers
+        assignments, of = _assigned([markers[p] for p in mappings.points.ravel().tolist()], rows.ravel())
+        body = np.repeat(np.arange(len(fits)), mappings.points.shape[1])[of]
+        return cls(mappings.robot, States.at_rest(fits.R, fits.t, START_SIGMAS), assignments, body)
+
+    @classmethod
+    def of_singles(
+        cls, robots: Sequence[int], markers: list[Marker], rotations: Sequence[Array], table: MarkerTable
+    ) -> "Starts":
+        """Single-marker robots (rows) at triangulated markers, one for each, with rotations (3, 3)."""
+        p = np.array([marker.position for marker in markers]).reshape(-1, 3)
+        states = States.at_rest(np.array(rotations).reshape(-1, 3, 3), p, START_SIGMAS_SINGLE)
+        robot = np.array(robots, np.intp)
+        return cls(robot, states, *_assigned(markers, table.first[robot]))
+
+
+def refine(
+    estimator: Estimator, table: TrackTable, starts: Starts, detections: DetectionTable
+) -> RefinedFits:
+    """Update each start with its detections.
+
+    Args:
+        estimator: of all robots.
+        table: robots and their last states.
+        starts: of some robots; of one robot several.
+        detections: of the frame set.
+    """
+    n, body = len(starts.robot), starts.body
+    observations = MatchedObservations.of(starts.assignments, detections, table.markers)
+    observations = replace(observations, discs=replace(observations.discs, body=body))
+    estimator = estimator.select(starts.robot)
+    prediction = estimator.predict(starts.states, np.full(n, START_S))
+    states, residuals = estimator.update(prediction, observations, SMALL)
+    d2 = observations.misfit(residuals)
+    rows = starts.robot.tolist()
+    history = np.array(
+        [history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]
+    )
+    is_expected = (history < POSITION_GATE) & np.array([is_local(table, k) for k in rows], bool)
+    return RefinedFits(
+        starts.robot,
+        states,
+        np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
+        mean_by_body(d2, body, n),
+        is_expected,
+        explained_shares(estimator.cameras, table.markers, detections, starts.robot, states),
+        shared_views(starts.assignments, body, detections, n),
+        starts.assignments.with_residuals(residuals),
+        body,
+    )
+
+
+def _assigned(markers: list[Marker], rows: Index) -> tuple[Assignments, Index]:
+    """The detections of triangulated markers, assigned to `rows` of the marker table; and the marker of each."""
+    detections = [np.empty(0, np.intp), *(marker.detections for marker in markers)]
+    of = np.repeat(np.arange(len(markers)), [len(marker.detections) for marker in markers])
+    return Assignments.of(np.concatenate(detections), rows[of]), of
