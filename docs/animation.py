@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from playwright.sync_api import Page, sync_playwright
 
-from calib.rig.messages import RigMessage
+from calib.rig.rig_messages import RigMessage
 from camera_node.protocol.messages import decode
 from tests.web.browser import FLAGS, loopback
 from web.page import add_replay_page

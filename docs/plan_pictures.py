@@ -8,8 +8,8 @@ from pathlib import Path
 
 from calib.plan.camera_kind import CameraKind
 from calib.plan.description import Plan, PlannedRobots, Requirement
-from calib.plan.figures import draw_coverage, draw_distribution, draw_errors
 from calib.plan.placement import PlacementProblem, suggest_placement
+from calib.plan.plan_report import draw_coverage, draw_distribution, draw_errors
 from calib.plan.planner import PlannedArena, evaluate
 from camera_node.foundation.terminal import progress_bar
 

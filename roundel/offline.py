@@ -13,9 +13,8 @@ import msgspec
 
 from calib.errors import CalibrationError
 from calib.intrinsics.board import make_finder
-from calib.intrinsics.calibrate import BoardViews, Model, merge_lenses
-from calib.intrinsics.calibrated_lens import CalibratedLens
 from calib.intrinsics.images import find_cameras, read_frames
+from calib.intrinsics.lens_calibration import BoardViews, CalibratedLens, Model, merge_lenses
 from calib.intrinsics.nominal_lens import with_nominal_lenses
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig

@@ -30,19 +30,19 @@ CALIBRATE = Command(
         _calibration(
             "intrinsics",
             "calibrate lenses from images of a board",
-            "intrinsics:Intrinsics",
+            "calibrate_intrinsics:Intrinsics",
             "roundel calibrate intrinsics --frames board --board charuco:5x4:0.054 --out rig.yaml",
         ),
         _calibration(
             "wand",
             "calibrate camera poses from a wand that is waved in front of the cameras",
-            "wand:Wand",
+            "calibrate_wand:Wand",
             "roundel calibrate wand --live --wand wand.yaml --rig rig.yaml --out rig.yaml",
         ),
         _calibration(
             "world",
             "fix the ground plane, the origin and the axes",
-            "world:World",
+            "calibrate_world:World",
             "roundel calibrate world --rig rig.yaml --frame l.yaml --live --out rig.yaml",
         ),
         _calibration(
@@ -67,19 +67,19 @@ CALIBRATE = Command(
         _calibration(
             "undo",
             "restore the rig from before the last calibration",
-            "undo:Undo",
+            "rig_versions:Undo",
             "roundel calibrate undo --rig rig.yaml",
         ),
         _calibration(
             "redo",
             "restore the rig that was undone last",
-            "undo:Redo",
+            "rig_versions:Redo",
             "roundel calibrate redo --rig rig.yaml",
         ),
         _calibration(
             "apply",
             "have the running server use a rig",
-            "apply:Apply",
+            "rig_versions:Apply",
             "roundel calibrate apply --rig rig.yaml",
         ),
     ),

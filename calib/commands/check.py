@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 
 from calib.commands.inputs import WandOptions
-from calib.commands.output import check_folder, provenance, save_maps, write_rig
-from calib.commands.report import print_report
+from calib.commands.output import check_folder, provenance, write_rig
+from calib.commands.printed_report import print_report, save_maps
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`roundel calibrate import` and `roundel calibrate export`: recordings and rigs from and to other programs."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,16 +10,39 @@ import tyro
 
 from calib.commands.output import provenance, write_rig
 from calib.errors import CalibrationError
-from calib.formats.data import PixelOrigin, PointTable
-from calib.formats.registry import FORMATS, Format
+from calib.formats import argus, caliscope, colmap, kalibr, multicamselfcal, opencv
+from calib.formats.data import ForeignData, PixelOrigin, PointTable
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 
+Reader = Callable[[Sequence[Path], PixelOrigin], ForeignData]
+Writer = Callable[[Rig, Path, PixelOrigin], list[str]]
 FormatName = Literal[
     "argus", "easywand", "dltdv", "multicamselfcal", "caliscope", "opencv", "kalibr", "colmap"
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """How a format is read (None: export only) and written, and where it counts pixels from."""
+
+    read: Reader | None
+    write: Writer
+    origin: PixelOrigin
+
+
+FORMATS = {
+    "argus": Format(argus.read, argus.write, argus.ARGUS),
+    "easywand": Format(argus.read, argus.write, argus.DLTDV8),
+    "dltdv": Format(argus.read, argus.write, argus.DLTDV8),
+    "multicamselfcal": Format(multicamselfcal.read, multicamselfcal.write, multicamselfcal.FROM_ZERO),
+    "caliscope": Format(caliscope.read, caliscope.write, caliscope.FROM_ZERO),
+    "opencv": Format(opencv.read, opencv.write, opencv.FROM_ZERO),
+    "kalibr": Format(kalibr.read, kalibr.write, kalibr.FROM_ZERO),
+    "colmap": Format(None, colmap.write, colmap.FROM_ZERO),
+}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,12 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.intrinsics.residual_plot import draw_residuals
 from calib.live.rig_requests import set_rig
-from calib.rig.precision_plot import draw_precision
 from calib.rig.rig import Rig, save_rig
-from calib.wand.quality.grade import RigQuality
-from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestError
@@ -51,20 +47,6 @@ def save_image(path: Path, image: NDArray[np.uint8]) -> None:
         path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     except OSError as error:
         raise ConfigError(f"{path} can't be written: {error.strerror}") from None
-
-
-def save_maps(folder: Path, result: WandCalibration, quality: RigQuality) -> None:
-    """Write an image of each camera's residuals, with the area to wave in next, and one of the expected errors."""
-    observations, adjusted = result.observations, result.adjusted
-    for k, camera in enumerate(quality.cameras):
-        rows, lens = adjusted.used & (observations.camera == k), result.rig.cameras[camera.name]
-        image = draw_residuals(
-            camera.name, lens, observations.uv[rows], adjusted.residuals[rows], camera.missing
-        )
-        save_image(folder / f"{camera.name}.png", image)
-    if quality.expected is not None:
-        save_image(folder / "expected.png", draw_precision(quality.expected, result.rig.placed()))
-    say(f"wrote images of residuals and expected errors to {folder}")
 
 
 def provenance() -> dict[str, Any]:

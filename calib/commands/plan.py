@@ -14,9 +14,9 @@ from calib.plan.camera_kind import CameraKind, PlannedCamera
 from calib.plan.catalogue import CATALOGUE
 from calib.plan.description import MAX_CAMERAS, Plan, Suggestion
 from calib.plan.placement import PlacementProblem, SuggestedPlaces, suggest_placement
+from calib.plan.plan_report import check_report, write_report
+from calib.plan.plan_summary import describe, summarize
 from calib.plan.planner import PlannedArena, evaluate, plan_around
-from calib.plan.report import check_report, write_report
-from calib.plan.summary import describe, summarize
 from calib.rig.camera import Camera
 from calib.rig.rig import load_rig
 from camera_node.foundation.config import dump_yaml, load_yaml, write_atomically

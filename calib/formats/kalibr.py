@@ -14,8 +14,7 @@ import numpy as np
 import yaml
 
 from calib.errors import CalibrationError
-from calib.formats.data import ForeignData, PixelOrigin, make_camera
-from calib.formats.lens_models import with_coefficients
+from calib.formats.data import ForeignData, PixelOrigin, make_camera, with_coefficients
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array

@@ -15,8 +15,15 @@ import cv2
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.formats.data import ForeignData, PixelOrigin, PointTable, make_camera, read_numbers, read_text
-from calib.formats.lens_models import with_coefficients
+from calib.formats.data import (
+    ForeignData,
+    PixelOrigin,
+    PointTable,
+    make_camera,
+    read_numbers,
+    read_text,
+    with_coefficients,
+)
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array

@@ -10,10 +10,9 @@ from rich.console import Group
 from rich.text import Text
 
 from calib.errors import CalibrationError
-from calib.intrinsics.adjustment import BoardView
-from calib.intrinsics.calibrate import MIN_VIEWS, BoardViews, Model
-from calib.intrinsics.calibrated_lens import CalibratedLens
 from calib.intrinsics.images import NamedImage
+from calib.intrinsics.lens_adjustment import BoardView
+from calib.intrinsics.lens_calibration import MIN_VIEWS, BoardViews, CalibratedLens, Model
 from calib.rig.coverage import Coverage, enumerate_words
 from camera_node.foundation.arrays import Array
 

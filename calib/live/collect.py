@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Collects detections from running cameras."""
+"""Collects detections, and the sizes of images, from running cameras."""
 
 import queue
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -16,13 +17,16 @@ from calib.errors import CalibrationError
 from calib.rig.coverage import Coverage
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.terminal import progress_console
-from camera_node.protocol.messages import Detections, Keys, MessageError, decode
+from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
 from camera_node.protocol.publishers import Publishers
+from camera_node.protocol.session import guarded
 
 INSPECT_EVERY_S = 0.2
 SILENT_S = 2.0  # without a frame: the camera counts as silent
 COMPARED_NS = 500_000_000  # between two frames that show whether a roundel moves
 MOVED_PX = 10.0  # in that time; a wand that is held still moves as far
+LISTEN_S = 2.5  # a camera publishes its status once a second
+MAX_CAMERAS = 256
 
 
 @dataclass(slots=True)
@@ -155,3 +159,24 @@ def collect_with_progress(
             return ""
 
         return collect_frames(session, arena, seconds, show)[0]
+
+
+def running_camera_sizes(
+    session: zenoh.Session, arena: str, seconds: float = LISTEN_S
+) -> dict[str, tuple[int, int]]:
+    """Width and height, pixels, of all cameras that publish their status within that time."""
+    sizes: dict[str, tuple[int, int]] = {}
+    key = Keys(arena).camera_status()
+
+    def receive(sample: zenoh.Sample) -> None:
+        try:
+            status = decode(sample.payload.to_bytes(), CameraStatus)
+        except MessageError:
+            return
+        if status.width > 0 and status.height > 0 and len(sizes) < MAX_CAMERAS:
+            sizes[status.camera] = status.width, status.height
+
+    subscriber = session.declare_subscriber(key, guarded(key, receive))
+    threading.Event().wait(seconds)
+    subscriber.undeclare()
+    return dict(sizes)

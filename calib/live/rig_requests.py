@@ -5,7 +5,8 @@ import time
 
 import zenoh
 
-from calib.rig.messages import (
+from calib.rig.rig import Rig
+from calib.rig.rig_messages import (
     RigHistory,
     RigMessage,
     RigRequest,
@@ -15,7 +16,6 @@ from calib.rig.messages import (
     set_rig_key,
     undo_rig_key,
 )
-from calib.rig.rig import Rig
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.requests import (

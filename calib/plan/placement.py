@@ -14,8 +14,7 @@ import numpy as np
 
 from calib.plan.camera_kind import CameraKind
 from calib.plan.description import Mount, Plan
-from calib.plan.precision import Uncertainty, view_information
-from calib.plan.views import RoundelSensor
+from calib.plan.expected_error import RoundelSensor, Uncertainty, view_information
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Array
 

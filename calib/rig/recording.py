@@ -18,7 +18,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import IndexType, Writer
 
 from calib.rig.camera import Camera
-from calib.rig.history import History
+from calib.rig.file_history import History
 from calib.rig.recording_repair import repair_recording
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode

@@ -1,28 +1,128 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Locates landmarks, which are stationary roundels at surveyed positions, by their mutual distances.
+"""Moves the world of a rig to landmarks: stationary roundels at known places, of an L-shaped frame, a standing wand, or
+a survey.
 
-Roundels need no numbers. Hypotheses are the motions that bring three landmarks to three triangulated points with the
-same mutual distances (two, if the landmarks lie on a line). The hypothesis under which two cameras or more see most
-landmarks wins.
+Roundels need no numbers: landmarks are found by their mutual distances. Hypotheses are the motions that bring three
+landmarks to three triangulated points with the same mutual distances (two, if the landmarks lie on a line). The
+hypothesis under which two cameras or more see most landmarks wins.
 """
 
+import csv
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, transform
+from calib.rig.rig import Rig
 from calib.rig.triangulation import triangulate_point
-from calib.world.still_roundels import StillRoundel, disc_centres
-from calib.world.world_frame import is_collinear
+from calib.world.still_roundels import StillRoundel, disc_centres, find_still_roundels
+from calib.world.world_frame import align_positions, align_standing_wand, check_above, is_collinear
 from camera_node.foundation.arrays import Array
-from camera_node.geometry.pose import rigid_motions
+from camera_node.foundation.config import load_yaml
+from camera_node.foundation.errors import ConfigError
+from camera_node.geometry.body import Body
+from camera_node.geometry.pose import invert, rigid_motions
+from camera_node.protocol.messages import Detections
 
 FIT_PX = 6.0  # reprojection distance of a match: rig, survey and detection all have errors
 MERGE_M = 0.02  # distance within which triangulated points are one
 DISTANCE_SLACK = (0.02, 0.03)  # of a distance between landmarks: metres, and fraction of the distance
+
+
+def read_positions(path: Path, key: str = "camera") -> dict[str, Array]:
+    """Read positions (3,) by name, metres, from a CSV or a YAML file.
+
+    A CSV has the columns `key` (or `name`), x, y, z. A YAML file maps names to [x, y, z].
+
+    Raises:
+        ConfigError: the file is missing, a column is missing, a name occurs twice, or a coordinate is not a number.
+    """
+    if path.suffix.lower() in (".yaml", ".yml"):
+        entries = load_yaml(path, dict[str, tuple[float, float, float]])
+        return {name: np.array(position) for name, position in entries.items()}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return _read_csv(path, csv.DictReader(file), key)
+    except (OSError, UnicodeDecodeError):
+        raise ConfigError(f"{path} can't be read; it needs the columns {key},x,y,z") from None
+
+
+def _read_csv(path: Path, reader: csv.DictReader, key: str) -> dict[str, Array]:
+    columns = set(reader.fieldnames or ())
+    key = key if key in columns else "name"
+    if missing := {key, "x", "y", "z"} - columns:
+        raise ConfigError(f"{path} lacks the column {', '.join(sorted(missing))}; it needs {key},x,y,z")
+    positions: dict[str, Array] = {}
+    for row in reader:
+        if row[key] in positions:
+            raise ConfigError(f"{path} names '{row[key]}' twice; remove one row")
+        positions[row[key]] = _parse_point(row, path, reader.line_num)
+    return positions
+
+
+def _parse_point(row: Mapping[str, str], path: Path, line: int) -> Array:
+    try:
+        point = np.array([float(row[axis]) for axis in "xyz"])
+    except (TypeError, ValueError):
+        point = np.full(3, np.nan)
+    if not np.isfinite(point).all():
+        raise ConfigError(f"{path}, line {line}: x, y and z must be numbers, in metres")
+    return point
+
+
+@dataclass(frozen=True)
+class WorldChange:
+    """A rig in its new world.
+
+    Attributes:
+        rig: the moved rig.
+        distances: of roundels or cameras from their surveyed positions, metres, by name.
+        missing: names of the roundels that fewer than two cameras see, which were not used.
+    """
+
+    rig: Rig
+    distances: dict[str, float] = field(default_factory=dict)
+    missing: list[str] = field(default_factory=list)
+
+    def origin_in(self, before: Rig) -> Array:
+        """T_old_new (4, 4): the new origin and axes in the world of the rig before the change, of the same scale."""
+        new = self.rig.placed()
+        name = next(iter(before.placed().keys() & new.keys()))
+        return before.cameras[name].matrix() @ invert(new[name].matrix())
+
+
+def name_markers(body: Body) -> dict[str, Array]:
+    """The markers of a body as landmarks: their numbers and positions (3,), metres."""
+    return {str(k): point for k, point in enumerate(body.points)}
+
+
+def align_to_roundels(
+    rig: Rig, landmarks: Mapping[str, Array], messages: Sequence[Detections], foot_m: float | None = None
+) -> WorldChange:
+    """Move the world to stationary roundels.
+
+    Args:
+        rig: with placed cameras.
+        landmarks: positions (3,) of the roundels in the new world, metres, by name.
+        messages: detections of the cameras while the roundels stand still.
+        foot_m: for a wand that stands upright: the height of its lowest roundel above the floor; None for roundels
+            whose positions fix the world.
+
+    Raises:
+        CalibrationError: the roundels are not found, or do not fix a world.
+    """
+    located = locate_landmarks(rig.placed(), find_still_roundels(messages), landmarks)
+    missing = [name for name in landmarks if name not in located]
+    if foot_m is not None:
+        moved = align_standing_wand(rig, np.array(list(located.values())), foot_m)
+        return WorldChange(moved, missing=missing)
+    moved, distances = align_positions(rig, located, landmarks, "roundel")
+    check_above(moved, landmarks)
+    return WorldChange(moved, distances, missing)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,8 +24,8 @@ from calib.live.rig_requests import (
     set_rig,
     undo_rig,
 )
-from calib.rig.messages import RigHistory, RigMessage
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigHistory, RigMessage
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, RelativePositions, decode

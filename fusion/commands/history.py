@@ -8,7 +8,7 @@ from datetime import datetime
 import zenoh
 
 from calib.live.rig_requests import redo_rig, request_rig, request_rig_history, undo_rig
-from calib.rig.messages import RigMessage, RigVersion
+from calib.rig.rig_messages import RigMessage, RigVersion
 from camera_node.foundation.errors import printable
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions

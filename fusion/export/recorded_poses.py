@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from calib.rig.camera import Camera
-from calib.rig.messages import RigMessage
 from calib.rig.recording import read_messages
+from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import MessageError, decode
 from fusion.model.robots import Robot

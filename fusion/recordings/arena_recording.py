@@ -16,9 +16,9 @@ from pathlib import Path
 
 import zenoh
 
-from calib.rig.messages import RigMessage
 from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from camera_node.protocol.server_connection import ServerConnection

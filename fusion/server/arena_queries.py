@@ -9,7 +9,7 @@ from functools import partial
 import msgspec
 import zenoh
 
-from calib.rig.messages import (
+from calib.rig.rig_messages import (
     RigMessage,
     RigRequest,
     RigStepRequest,

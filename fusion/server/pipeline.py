@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from calib.rig.camera import Camera
-from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from calib.rig.messages import RigMessage
+from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.logs import about
 from camera_node.foundation.service import ServiceManager
 from camera_node.protocol.messages import Keys, MessageError, decode, encode

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.commands.formats import FormatName
-from calib.formats.registry import FORMATS
+from calib.commands.formats import FORMATS, FormatName
 from tests.calib.synthetic import ring
 
 LENGTH_M = 0.5

@@ -9,8 +9,8 @@ from pathlib import Path
 import zenoh
 
 from calib.live.rig_requests import request_rig
-from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
 from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.messages import ClockReply, encode
 from camera_node.protocol.server_connection import ServerConnection

@@ -7,8 +7,8 @@ import numpy as np
 import zenoh
 
 from calib.rig.camera import Camera
-from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, encode

@@ -12,8 +12,8 @@ from typing import Any
 
 import msgspec
 
-from calib.rig.messages import RigHistory, RigMessage
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigHistory, RigMessage
 from camera_node.foundation.errors import printable
 from camera_node.protocol.messages import (
     CameraStatus,

@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 
 import viser
 
-from calib.rig.messages import RigHistory, RigVersion
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigHistory, RigVersion
 from camera_node.foundation.errors import printable
 from fusion.protocol.arena_health import assess_calibration, calibration_problems, describe_calibration
 from web.html_tables import Column, HtmlTable, TableRow, small

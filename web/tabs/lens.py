@@ -15,10 +15,9 @@ import numpy as np
 import viser
 
 from calib.intrinsics.board import make_finder
-from calib.intrinsics.calibrate import BoardViews, Model, merge_lenses
-from calib.intrinsics.calibrated_lens import CalibratedLens
 from calib.intrinsics.guided_capture import CaptureProgress, capture_views
 from calib.intrinsics.images import take_snapshots
+from calib.intrinsics.lens_calibration import BoardViews, CalibratedLens, Model, merge_lenses
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.coverage import Coverage
 from calib.rig.rig import Rig

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from calib.intrinsics.nominal_lens import load_known_lenses
 from calib.live.rig_requests import set_rig
-from calib.rig.changes import holds_rig
 from calib.rig.rig import Rig, save_rig
+from calib.rig.rig_messages import holds_rig
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import RoundelError
 from camera_node.geometry.body import PrintedWand

@@ -9,7 +9,7 @@ import viser
 
 from calib.live.collect import collect_frames
 from calib.rig.rig import Rig
-from calib.world.alignment import WorldChange, align_to_roundels, name_markers
+from calib.world.landmarks import WorldChange, align_to_roundels, name_markers
 from calib.world.world_frame import is_collinear
 from camera_node.foundation.config import example_file, load_yaml
 from camera_node.geometry.body import Body

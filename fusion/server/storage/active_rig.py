@@ -14,10 +14,19 @@ from typing import Literal
 import msgspec
 
 from calib.rig.camera import Camera
-from calib.rig.changes import MAX_CHANGE, RigChange, describe_change, holds_rig, read_change
-from calib.rig.history import History
-from calib.rig.messages import MAX_VERSIONS, RigHistory, RigMessage, RigVersion
+from calib.rig.file_history import History
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
+from calib.rig.rig_messages import (
+    MAX_CHANGE,
+    MAX_VERSIONS,
+    RigChange,
+    RigHistory,
+    RigMessage,
+    RigVersion,
+    describe_change,
+    holds_rig,
+    read_change,
+)
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError, RoundelError
 from camera_node.protocol.requests import RequestSource

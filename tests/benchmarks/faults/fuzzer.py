@@ -16,7 +16,7 @@ import msgspec
 import tyro
 import zenoh
 
-from calib.rig.messages import redo_rig_key, rig_history_key, undo_rig_key
+from calib.rig.rig_messages import redo_rig_key, rig_history_key, undo_rig_key
 from camera_node.foundation.terminal import say
 from camera_node.protocol.messages import Keys, Settings
 from camera_node.protocol.registration import assigned_key, change_key, register_key, registered_key

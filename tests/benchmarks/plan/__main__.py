@@ -18,9 +18,9 @@ from rich.table import Table
 
 from calib.plan.camera_kind import CameraKind
 from calib.plan.description import Plan, PlannedRobots
+from calib.plan.expected_error import CUT_EXPONENT
 from calib.plan.placement import PlacementProblem, SuggestedPlaces, evaluate_placement, suggest_placement
 from calib.plan.planner import PlannedArena, evaluate
-from calib.plan.views import CUT_EXPONENT
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.terminal import progress_bar
 from tests.benchmarks.plan.arena import DIAMETER_M, HALF_M, HEIGHTS_M, SMALL_M

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from calib.plan.expected_error import RoundelSensor
 from calib.plan.planner import PlannedArena
-from calib.plan.views import RoundelSensor
 from calib.rig.camera import Camera
 from camera_node.detector import Detector
 from camera_node.foundation.arrays import Array

@@ -10,11 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.commands.formats import ExportRig, FormatName, ImportData, make_rig
+from calib.commands.formats import FORMATS, ExportRig, FormatName, ImportData, make_rig
 from calib.errors import CalibrationError
-from calib.formats.data import ForeignData
-from calib.formats.lens_models import with_coefficients
-from calib.formats.registry import FORMATS
+from calib.formats.data import ForeignData, with_coefficients
 from calib.rig.camera import transform
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.rig.wand_file import WandBody

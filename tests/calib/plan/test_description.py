@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from calib.plan.camera_kind import CameraKind
-from calib.plan.description import Plan
-from calib.plan.volume import Volume, find_regions
+from calib.plan.description import Plan, Volume, find_regions
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import ConfigError
 from tests.conftest import ROOT

@@ -8,10 +8,8 @@ import pytest
 from calib.plan.camera_kind import CameraKind
 from calib.plan.catalogue import CATALOGUE
 from calib.plan.description import ImageQuality, Plan, PlannedRobots
-from calib.plan.network import message_bytes
-from calib.plan.planner import PlannedArena, evaluate
-from calib.plan.precision import FLOOR_PX, Uncertainty, combine_views, expected_errors
-from calib.plan.views import RoundelSensor
+from calib.plan.expected_error import FLOOR_PX, RoundelSensor, Uncertainty, combine_views, expected_errors
+from calib.plan.planner import PlannedArena, evaluate, message_bytes
 from calib.rig.camera import Camera
 from calib.rig.triangulation import triangulate_point
 from camera_node.foundation.config import load_yaml

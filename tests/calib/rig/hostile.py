@@ -5,8 +5,8 @@ from typing import Any
 
 import msgspec
 
-from calib.rig.messages import MAX_RIG_BYTES
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import MAX_RIG_BYTES
 
 NAN, HUGE = float("nan"), 1e308
 

@@ -3,8 +3,7 @@
 
 import numpy as np
 
-from calib.rig.precision_map import FloorGrid, map_precision
-from calib.rig.precision_plot import draw_precision
+from calib.rig.precision_map import FloorGrid, draw_precision, map_precision
 from tests.calib.synthetic import ring
 
 

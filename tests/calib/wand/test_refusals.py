@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.commands.report import MAX_GROSS, print_report
+from calib.commands.printed_report import MAX_GROSS, print_report
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate

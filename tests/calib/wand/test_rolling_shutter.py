@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib.commands.report import print_report
+from calib.commands.printed_report import print_report
 from calib.rig.camera import OFFSET, READOUT
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate

@@ -1,20 +1,47 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Landmarks are located by their distances, and fix the world; ambiguous ones are refused."""
+"""Landmarks: reading their surveyed positions, and finding them among stationary roundels."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calib.errors import CalibrationError
-from calib.world.landmarks import locate_landmarks
+from calib.world.landmarks import locate_landmarks, read_positions
 from calib.world.still_roundels import find_still_roundels
 from calib.world.world_frame import align_positions, align_standing_wand, check_above
 from camera_node.foundation.config import load_yaml
+from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from tests.calib.synthetic import ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world, see_discs
 from tests.conftest import ROOT
+
+
+def test_positions_are_read_from_yaml_and_csv(tmp_path: Path):
+    (tmp_path / "points.yaml").write_text("a: [0, 1, 2]\nb: [3.5, 4, 5]\n")
+    assert read_positions(tmp_path / "points.yaml")["b"] == pytest.approx([3.5, 4, 5])
+    (tmp_path / "points.csv").write_text("name,x,y,z\na,0,1,2\n")
+    assert list(read_positions(tmp_path / "points.csv")) == ["a"]
+    (tmp_path / "points.yaml").write_text("a: [0, 1]\n")
+    with pytest.raises(ConfigError, match=r"points\.yaml: "):
+        read_positions(tmp_path / "points.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("camera,x,y\n", "column z"),
+        ("camera,x,y,z\na,1,2,up\n", "line 2"),
+        ("camera,x,y,z\na,1,2,3\na,1,2,3\n", "'a' twice"),
+    ],
+)
+def test_a_broken_survey_is_refused(tmp_path: Path, text: str, fault: str):
+    path = tmp_path / "survey.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=fault):
+        read_positions(path)
 
 
 @pytest.mark.parametrize("numbered", [False, True])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calib.rig.camera import Camera
-from calib.rig.messages import RigMessage
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
 from camera_node.detection.detector import Detector
 from camera_node.detection.known_lens import KnownLens
 from camera_node.detection.roundels import DetectedRoundels

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-import calib.rig.messages
+import calib.rig.rig_messages
 import camera_node.protocol.messages
 import fusion.protocol.pose_messages
 from camera_node.detection.roundels import Roundels
@@ -136,7 +136,7 @@ def test_every_field_is_documented():
     sections = (ROOT / "docs" / "messages.md").read_text().split("\n## ")
     for module in (
         camera_node.protocol.messages,
-        calib.rig.messages,
+        calib.rig.rig_messages,
         fusion.protocol.pose_messages,
     ):
         for name, kind in vars(module).items():

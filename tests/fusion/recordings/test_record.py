@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.rig.messages import RigMessage
 from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.server_connection import Connection, ServerConnection

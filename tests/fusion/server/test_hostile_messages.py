@@ -17,7 +17,7 @@ import psutil
 import pytest
 import zenoh
 
-from calib.rig.messages import redo_rig_key, set_rig_key, undo_rig_key
+from calib.rig.rig_messages import redo_rig_key, set_rig_key, undo_rig_key
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client

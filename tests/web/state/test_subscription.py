@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import zenoh
 
-from calib.rig.messages import RigMessage, undo_rig_key
 from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage, undo_rig_key
 from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.server_connection import ServerConnection

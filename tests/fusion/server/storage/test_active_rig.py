@@ -11,9 +11,9 @@ import msgspec
 import pytest
 
 from calib.live.rig_requests import set_rig
-from calib.rig.history import MAX_OLD, History
-from calib.rig.messages import RigHistory
+from calib.rig.file_history import MAX_OLD, History
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
+from calib.rig.rig_messages import RigHistory
 from camera_node.foundation.errors import NetworkError
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.requests import RequestError

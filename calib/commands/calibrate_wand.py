@@ -12,14 +12,13 @@ from rich.live import Live
 from zenoh import Session
 
 from calib.commands.inputs import WandOptions, require_positive
-from calib.commands.output import check_folder, conclude, provenance, put_in_force, save_maps, write_rig
-from calib.commands.report import print_recalibration, print_report, show_progress
+from calib.commands.output import check_folder, conclude, provenance, put_in_force, write_rig
+from calib.commands.printed_report import print_recalibration, print_report, save_maps, show_progress
 from calib.errors import CalibrationError
 from calib.intrinsics.nominal_lens import FIELD_OF_VIEW_DEG, load_known_lenses, with_nominal_lenses
-from calib.live.camera_sizes import running_camera_sizes
-from calib.live.collect import CollectedFrames
+from calib.live.collect import CollectedFrames, running_camera_sizes
+from calib.live.live_session import run_wand_session
 from calib.live.trials import MAX_SECONDS, WandSession
-from calib.live.wand_session import run_wand_session
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand

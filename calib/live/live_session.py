@@ -1,10 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The progress of a wand session: what was seen, when there is enough, and where to wave next."""
+"""Runs a wand session: collects frames from running cameras until the calibration is precise enough.
 
+Every few seconds, a trial calibration (`trials`) predicts the result of all frames. The session ends when
+
+- every camera that sends frames is placed,
+- no camera's own covariance adds more than 5 % to the error of a roundel's pixel, and
+- the wand was seen in half of the image area that each camera shares with others, or in no new area for 15 s;
+
+or when no roundel moves for 15 s: the wand was put down or carried away. While a camera is not placed, the session
+waits for the wand to return. Its progress says what was seen, and where to wave next.
+"""
+
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from calib.live.collect import CollectedFrames
-from calib.live.trials import Trial
+import zenoh
+
+from calib.live.collect import CollectedFrames, collect_frames
+from calib.live.trials import Trial, TrialSolver, WandSession
 
 MAX_ADDED_ERROR = 0.05  # that a camera's covariance may add to the error of a pixel, as a fraction of it
 MIN_USED = 0.5  # of the image area that a camera shares with others
@@ -129,3 +143,41 @@ def _name_silent(silent: list[str], n_cameras: int) -> str:
     if len(silent) == n_cameras:
         return "no camera sends frames any more; check that the server runs"
     return f"{' and '.join(map(repr, silent))}: no frames any more; check that the camera's program runs"
+
+
+def run_wand_session(
+    session: zenoh.Session,
+    arena: str,
+    settings: WandSession,
+    show: Callable[[SessionProgress], None] = lambda progress: None,
+    stop: threading.Event | None = None,
+) -> tuple[CollectedFrames, str]:
+    """Collect the detections of all cameras of an arena while a person waves the wand.
+
+    Args:
+        session, arena: where cameras publish.
+        settings: the rig, the wand, and when to end.
+        show: called from this thread a few times a second.
+        stop: ends the session from another thread.
+
+    Returns:
+        the frames, and the reason for the end.
+
+    Raises:
+        CalibrationError: no message arrived.
+    """
+    rule = StoppingRule()
+    with TrialSolver(settings) as solver:
+
+        def inspect(collected: CollectedFrames, elapsed: float) -> str:
+            if stop is not None and stop.is_set():
+                return "stopped by the user"
+            trial = solver.update(collected.messages, elapsed)
+            enough = trial is not None and rule.is_met(trial, elapsed)
+            show(summarize(collected, elapsed, trial, enough))
+            if enough and settings.stops_itself:
+                return "more frames would not improve the result"
+            is_gone = settings.stops_without_wand and is_wand_gone(collected, elapsed, trial, settings.trials)
+            return f"no roundel moved for {GONE_S:.0f} s" if is_gone else ""
+
+        return collect_frames(session, arena, settings.seconds, inspect)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A rig message is read back as it was sent; implausible and malformed ones are refused in one line."""
+"""Messages about the rig, and the sentences about its changes."""
 
+import os
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib.errors import CalibrationError
-from calib.rig.messages import RigMessage, RigRequest
+from calib.rig.camera import Camera
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
+from calib.rig.rig_messages import RigChange, RigMessage, RigRequest, describe_change, holds_rig, read_change
 from camera_node.foundation.errors import ConfigError
+from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import MessageError, decode, encode
 from camera_node.protocol.requests import RequestError, RequestSource, parse_request
 from tests.calib.rig.hostile import as_publication, hostile_messages
 from tests.calib.synthetic import ring
+from tests.calib.world.landmarks import in_another_world
+from tests.web.arena import four_cameras
 
 RIG = ring(2).truth
 HOSTILE = hostile_messages(RIG)
+FOUR = four_cameras()
+CHANGE = RigChange(t_ns=10**18, change="north 12.0 mm", source=RequestSource("web", "lab", "x"))
 
 
 def test_a_message_is_read_back():
@@ -102,3 +109,55 @@ def test_a_date_that_yaml_reads_as_one_is_no_fault(tmp_path):
     rig = load_rig(tmp_path / "rig.yaml")
     assert rig.calibration["date"] == date(2026, 11, 22)
     assert decode(encode(RigMessage(t_ns=0, rig=rig)), RigMessage).rig.cameras == rig.cameras
+
+
+def replaced(name: str, **fields: object) -> Rig:
+    return Rig(cameras={**FOUR.cameras, name: msgspec.structs.replace(FOUR.cameras[name], **fields)})
+
+
+def moved(camera: Camera, metres: float) -> Pose:
+    T = camera.matrix()
+    T[0, 3] += metres
+    return Pose.from_matrix(T)
+
+
+def test_changes_are_described():
+    without_west = Rig(cameras={name: camera for name, camera in FOUR.cameras.items() if name != "west"})
+    renamed = Rig(cameras={"door" if name == "west" else name: c for name, c in FOUR.cameras.items()})
+    assert describe_change(None, FOUR) == "4 cameras placed"
+    assert describe_change(FOUR, FOUR) == "the same poses"
+    assert describe_change(FOUR, without_west) == "west not placed"
+    assert describe_change(without_west, FOUR) == "west placed"
+    assert describe_change(FOUR, renamed) == "west renamed door"
+    assert describe_change(FOUR, in_another_world(FOUR)) == "floor and origin"
+    assert describe_change(FOUR, replaced("north", fx=600.0)) == "lens of north"
+    assert describe_change(FOUR, replaced("north", time_offset_ms=1.0)) == "clock offset of north"
+    pose = moved(FOUR.cameras["north"], 0.012)
+    assert describe_change(FOUR, replaced("north", T_world_cam=pose)) == "north 12.0 mm"
+
+
+def test_many_changes_are_counted():
+    cameras = {
+        name: msgspec.structs.replace(camera, T_world_cam=moved(camera, 0.01 * (k + 1)), fx=600.0)
+        for k, (name, camera) in enumerate(FOUR.cameras.items())
+    }
+    assert describe_change(FOUR, Rig(cameras=cameras)).endswith("20.0 mm, 1 more, lens of 4 cameras")
+
+
+def test_a_saved_rig_says_what_changed(tmp_path: Path):
+    """In a comment: programs that do not know it read the rig all the same."""
+    path = tmp_path / "rig.yaml"
+    save_rig(FOUR, path, CHANGE.line())
+    assert (read_change(path), load_rig(path)) == (CHANGE, FOUR)
+    assert holds_rig(path, FOUR)
+    assert not holds_rig(path, replaced("north", fx=600.0))
+
+
+@pytest.mark.parametrize(
+    "line", ["", "# changed: by hand\n", '# changed: {"t_ns": -1}\n', '# changed: {"t_ns": 1, "change": 2}\n']
+)
+def test_a_file_without_a_change_has_the_time_of_its_modification(tmp_path: Path, line: str):
+    path = tmp_path / "rig.yaml"
+    save_rig(FOUR, path, line)
+    os.utime(path, ns=(10**18, 10**18))
+    assert read_change(path) == RigChange(t_ns=10**18)

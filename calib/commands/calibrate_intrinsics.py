@@ -11,10 +11,9 @@ from calib.commands.inputs import require_one
 from calib.commands.output import check_folder, provenance, save_image, write_rig
 from calib.errors import CalibrationError
 from calib.intrinsics.board import make_finder
-from calib.intrinsics.calibrate import BoardViews, Model, merge_lenses
-from calib.intrinsics.calibrated_lens import CalibratedLens
 from calib.intrinsics.guided_capture import capture_views, make_panel
 from calib.intrinsics.images import find_cameras, read_frames, take_snapshots
+from calib.intrinsics.lens_calibration import BoardViews, CalibratedLens, Model, merge_lenses
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.rig import load_rig
 from camera_node.foundation.errors import ConfigError

@@ -19,19 +19,19 @@ import pytest
 import zenoh
 
 from calib.__main__ import execute
-from calib.commands.wand import Wand
+from calib.commands.calibrate_wand import Wand
 from calib.errors import CalibrationError
 from calib.live.collect import CollectedFrames
-from calib.live.session_progress import (
+from calib.live.live_session import (
     GONE_S,
     IDLE_S,
     SessionProgress,
     StoppingRule,
     is_wand_gone,
+    run_wand_session,
     summarize,
 )
 from calib.live.trials import Trial, TrialSolver, WandSession, select_blocks
-from calib.live.wand_session import run_wand_session
 from calib.rig.recording import read_detections
 from calib.rig.rig import load_rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode

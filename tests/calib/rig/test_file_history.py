@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from calib.errors import CalibrationError
-from calib.rig.history import MAX_OLD, History
+from calib.rig.file_history import MAX_OLD, History
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.foundation.errors import ConfigError
 from tests.calib.synthetic import ring
@@ -120,7 +120,7 @@ def test_undo_in_a_missing_folder_is_a_config_error(tmp_path: Path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from calib.rig.history import History
+from calib.rig.file_history import History
 from calib.rig.rig import load_rig, save_rig
 folder, step, n = Path(sys.argv[1]), sys.argv[2], 0
 rig = load_rig(folder / "new.yaml")

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from calib.commands.report import camera_table, print_report
+from calib.commands.printed_report import camera_table, print_report
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes

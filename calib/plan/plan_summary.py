@@ -6,8 +6,7 @@ import math
 import msgspec
 import numpy as np
 
-from calib.plan.network import BUSY
-from calib.plan.planner import CameraReach, PlanReport
+from calib.plan.planner import BUSY, CameraReach, PlanReport
 from calib.rig.precision_map import format_mm
 from camera_node.foundation.arrays import Array
 

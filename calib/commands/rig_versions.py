@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`roundel calibrate undo` and `roundel calibrate redo`: restore the previous rig, or the one that was undone last."""
+"""`roundel calibrate undo`, `redo` and `apply`: restore the previous rig, or the one that was undone last; have the
+server use a rig."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.commands.output import conclude
-from calib.rig.history import History, HistoryStep
+from calib.commands.output import conclude, put_in_force
+from calib.rig.file_history import History, HistoryStep
 from calib.rig.rig import Rig, load_rig
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
@@ -51,3 +52,16 @@ class Redo(RestoreOptions):
         history = History(self.rig)
         rig = load_rig(history.next())
         self.conclude(rig, history.redo(), "roundel calibrate redo")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Apply:
+    """Have the running server use a rig, at once and after a restart."""
+
+    rig: Path
+    """The rig, such as one that roundel calibrate wand wrote without --live."""
+    connection: ConnectionOptions = LOCAL_SERVER
+
+    def run(self) -> None:
+        """Hand the rig to the server."""
+        put_in_force(self.connection, load_rig(self.rig), self.rig, "roundel calibrate apply")

@@ -14,10 +14,9 @@ from calib.commands.output import check_folder, conclude, provenance, write_rig
 from calib.errors import CalibrationError
 from calib.live.collect import collect_with_progress
 from calib.rig.rig import Rig, load_rig
-from calib.world.alignment import align_to_roundels, name_markers
+from calib.world.landmarks import align_to_roundels, name_markers, read_positions
 from calib.world.resection import place_by_points
 from calib.world.still_roundels import find_still_roundels
-from calib.world.survey import read_positions
 from calib.world.world_frame import align_cameras, check_above, is_collinear
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import load_yaml

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Prints calibrations, and the progress of a wand session, on the terminal."""
+"""Prints calibrations, and the progress of a wand session, on the terminal, and writes images of them."""
+
+from pathlib import Path
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -7,7 +9,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from calib.live.session_progress import SessionProgress
+from calib.commands.output import save_image
+from calib.intrinsics.residual_plot import draw_residuals
+from calib.live.live_session import SessionProgress
+from calib.rig.precision_map import draw_precision
 from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
 from calib.wand.recalibration import Recalibration
@@ -184,3 +189,17 @@ def _scale_remarks(report: WandReport) -> list[str]:
     if report.compared is not None:
         lines.append(report.compared.sentence())
     return lines
+
+
+def save_maps(folder: Path, result: WandCalibration, quality: RigQuality) -> None:
+    """Write an image of each camera's residuals, with the area to wave in next, and one of the expected errors."""
+    observations, adjusted = result.observations, result.adjusted
+    for k, camera in enumerate(quality.cameras):
+        rows, lens = adjusted.used & (observations.camera == k), result.rig.cameras[camera.name]
+        image = draw_residuals(
+            camera.name, lens, observations.uv[rows], adjusted.residuals[rows], camera.missing
+        )
+        save_image(folder / f"{camera.name}.png", image)
+    if quality.expected is not None:
+        save_image(folder / "expected.png", draw_precision(quality.expected, result.rig.placed()))
+    say(f"wrote images of residuals and expected errors to {folder}")

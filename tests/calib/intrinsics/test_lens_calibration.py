@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from calib.errors import CalibrationError
-from calib.intrinsics.adjustment import BoardView, adjust_lens
 from calib.intrinsics.board import (
     BoardFinder,
     CharucoFinder,
@@ -21,10 +20,17 @@ from calib.intrinsics.board import (
     make_charuco_board,
     make_finder,
 )
-from calib.intrinsics.calibrate import COEFFICIENTS, BoardViews, Model, merge_lenses
-from calib.intrinsics.calibrated_lens import CalibratedLens, aspect_ratio
 from calib.intrinsics.guided_capture import capture_views
 from calib.intrinsics.images import read_frames
+from calib.intrinsics.lens_adjustment import BoardView, adjust_lens
+from calib.intrinsics.lens_calibration import (
+    COEFFICIENTS,
+    BoardViews,
+    CalibratedLens,
+    Model,
+    aspect_ratio,
+    merge_lenses,
+)
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
