@@ -8,7 +8,7 @@ from pathlib import Path
 
 import psutil
 
-from tests.waiting import wait_for
+from tests.waiting import DEADLINE_S, wait_for
 from web.demo.demo import Demo, conclude
 
 
@@ -27,7 +27,7 @@ def test_a_killed_demo_leaves_no_program(scene: Path):
     finally:
         demo.kill()
         demo.wait()
-    _, running = psutil.wait_procs(children, timeout=10.0)
+    _, running = psutil.wait_procs(children, timeout=DEADLINE_S)
     assert not running
 
 

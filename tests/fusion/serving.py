@@ -22,10 +22,9 @@ from fusion.server.server import Server
 from tests.conftest import ROOT
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, line
 from tests.processes import running
-from tests.waiting import Inbox, wait_for
+from tests.waiting import DEADLINE_S, Inbox, wait_for
 
 T = TypeVar("T")
-DEADLINE_S = 60.0  # for busy machines; nothing waits so long when all is well
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
 ATTEMPT_S = 3.0  # from a burst of frames to poses, before the burst is sent again
@@ -71,11 +70,7 @@ def connected(server: Server) -> Iterator[Client]:
 
 def until(condition: Callable[[], T]) -> T:
     """The first true value of `condition()`, polled; each poll blocks on the network by itself."""
-    deadline = time.monotonic() + DEADLINE_S
-    while time.monotonic() < deadline:
-        if value := condition():
-            return value
-    raise AssertionError("the deadline passed")
+    return wait_for(condition)
 
 
 def live(messages: list[Detections], ago_ns: int = 10**9) -> list[Detections]:

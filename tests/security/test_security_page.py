@@ -16,7 +16,7 @@ from camera_node.commands.camera import JoinArena
 from camera_node.foundation.config import load_yaml
 from tests.conftest import ROOT, free_port
 from tests.security.lab import KEYS, Lab
-from tests.waiting import wait_for, wait_for_port
+from tests.waiting import DEADLINE_S, wait_for, wait_for_port
 from tests.web.roundel.programs import roundel_command
 from web.page_access import Tokens
 
@@ -69,7 +69,7 @@ def test_the_folders_work_as_the_page_says(checkout: Path):
             roundel_command(*(word.replace("tls/server:7447", lab.endpoint) for word in record[1:])),
             cwd=keys / "viewer",
         )
-        closing.callback(recorder.wait, 30)
+        closing.callback(recorder.wait, DEADLINE_S)
         closing.callback(recorder.terminate)
         recording = keys / "viewer" / "arena.mcap"
         wait_for(recording.exists)

@@ -268,7 +268,7 @@ def test_a_killed_session_leaves_no_process():
         children = psutil.Process(session.pid).children()
         session.kill()
     assert children
-    assert not psutil.wait_procs(children, timeout=10.0)[1]
+    assert not psutil.wait_procs(children, timeout=DEADLINE_S)[1]
 
 
 def test_blocks_are_contiguous_and_evenly_spaced():

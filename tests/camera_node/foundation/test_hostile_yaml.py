@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from camera_node.foundation.config import MAX_BYTES, MAX_DEPTH, MAX_VALUES
+from tests.waiting import DEADLINE_S
 
 READ = """
 import resource, sys
@@ -19,7 +20,6 @@ from camera_node.geometry.body import Body
 resource.setrlimit(resource.RLIMIT_AS, (1 << 31, 1 << 31))
 run(lambda: print(load_yaml(Path(sys.argv[1]), Body)))
 """
-DEADLINE_S = 30.0  # importing takes most of it on a busy machine
 
 BOMB = "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 9)

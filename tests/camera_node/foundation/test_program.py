@@ -7,8 +7,7 @@ import sys
 import pytest
 
 from camera_node.foundation.program import glibc
-
-DEADLINE_S = 60.0
+from tests.waiting import DEADLINE_S
 
 RESIDENT = """
 import ctypes, os, threading, time

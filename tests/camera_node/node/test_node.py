@@ -23,6 +23,7 @@ from camera_node.node.node import Node, NodeOptions
 from camera_node.protocol.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.node.picture import CENTRE, render
+from tests.waiting import DEADLINE_S
 
 MS = 1_000_000
 START = 1_700_000_000_000_000_000
@@ -154,7 +155,7 @@ def test_stamps_are_in_the_servers_time(network, inbox, running, slow):
 
 def ask(session: zenoh.Session, key: str, payload: bytes | None = None) -> tuple[bool, bytes]:
     """The first reply: whether it is a success, and its payload."""
-    for reply in session.get(key, payload=payload, timeout=10.0):
+    for reply in session.get(key, payload=payload, timeout=DEADLINE_S):
         answer = reply.ok or reply.err
         assert answer
         return bool(reply.ok), answer.payload.to_bytes()

@@ -8,6 +8,7 @@ import pytest
 
 from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.server_connection import ServerConnection
+from tests.waiting import DEADLINE_S
 
 
 def test_actions_wait_for_the_server_and_then_run_at_once(network):
@@ -80,7 +81,7 @@ def test_a_session_that_opens_while_another_one_closes_finds_the_queryables(netw
         closing = threading.Thread(target=other.close)
         closing.start()
         with ServerConnection([network.endpoint]) as connection:
-            replies = connection.session(5.0).get("a/q", timeout=5.0)
+            replies = connection.session(5.0).get("a/q", timeout=DEADLINE_S)
             assert [reply.ok.payload.to_string() for reply in replies if reply.ok] == ["answer"]
-        closing.join(10.0)
+        closing.join(DEADLINE_S)
     queryable.undeclare()

@@ -21,6 +21,7 @@ from camera_node.protocol.session import (
     open_router,
     send_buffer_of,
 )
+from tests.waiting import DEADLINE_S
 
 
 class Ticker:
@@ -70,7 +71,7 @@ def test_the_router_relays_between_clients(network, inbox, ticking):
     queryable = camera.declare_queryable("a/q", lambda query: query.reply("a/q", b"answer"))
     assert got.until(len)
     assert alive.until(len)
-    assert [reply.ok.payload.to_string() for reply in viewer.get("a/q", timeout=5.0) if reply.ok] == [
+    assert [reply.ok.payload.to_string() for reply in viewer.get("a/q", timeout=DEADLINE_S) if reply.ok] == [
         "answer"
     ]
     token.undeclare()

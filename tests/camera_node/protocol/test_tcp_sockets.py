@@ -5,6 +5,7 @@ import socket
 import struct
 
 from camera_node.protocol.tcp_sockets import stop_lingering
+from tests.waiting import DEADLINE_S
 
 ON = struct.pack("ii", 1, 10)  # as Zenoh sets it
 
@@ -21,5 +22,5 @@ def test_tcp_sockets_linger_no_more_and_stay_open(network):
         other[0].sendall(b"x")
         assert other[1].recv(1) == b"x"
     queryable = router.declare_queryable("a/b", lambda query: query.reply("a/b", b"here"))
-    assert any(reply.ok for reply in client.get("a/b", timeout=10.0))
+    assert any(reply.ok for reply in client.get("a/b", timeout=DEADLINE_S))
     queryable.undeclare()

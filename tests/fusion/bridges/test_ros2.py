@@ -27,8 +27,8 @@ from fusion.commands.bridges.ros2 import ros2
 from fusion.protocol.pose_messages import RobotPose
 from tests.conftest import free_port
 from tests.fusion.bridges.pose_server import PoseServer, publish_poses, restart
+from tests.waiting import DEADLINE_S
 
-DEADLINE_S = 60.0
 ROS = get_typestore(Stores.ROS2_JAZZY)
 
 

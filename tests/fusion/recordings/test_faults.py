@@ -24,7 +24,7 @@ from fusion.commands.repair import repair
 from fusion.recordings.arena_recording import read_recording
 from tests.conftest import ROOT
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
-from tests.waiting import wait_for
+from tests.waiting import DEADLINE_S, wait_for
 
 pytestmark = pytest.mark.computed
 LIMIT = 200_000  # bytes that the full disk of these tests holds
@@ -129,7 +129,7 @@ def test_a_signal_closes_the_recording(tmp_path, number):
     with recorder(tmp_path, "record", str(path)) as (process, publish):
         wait_for(lambda: path.exists() and path.stat().st_size > 50_000, publish)
         process.send_signal(number)
-        out, errors = process.communicate(timeout=30)
+        out, errors = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, errors
     assert f"wrote {path}" in out
     assert KEYS.rig in {key for key, _, _ in indexed(path)}
@@ -140,7 +140,7 @@ def test_a_full_disk_ends_the_recording_in_one_line(tmp_path):
     path = tmp_path / "live.mcap"
     with recorder(tmp_path, str(LIMIT), "record", str(path), program=FULL_DISK) as (process, publish):
         wait_for(lambda: process.poll() is not None, publish)
-        _, errors = process.communicate(timeout=30)
+        _, errors = process.communicate(timeout=DEADLINE_S)
     lines = [line for line in errors.splitlines() if not line.startswith(("INFO", "WARNING"))]
     assert process.returncode == 2
     assert len(lines) == 1, errors
@@ -214,7 +214,7 @@ def test_a_recording_rotates(tmp_path):
     with recorder(tmp_path, "record", str(path), "--rotate-mb", "0.1") as (process, publish):
         wait_for(lambda: len(list(tmp_path.glob("live-*.mcap"))) >= 3, publish)
         process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=30)
+        process.communicate(timeout=DEADLINE_S)
     files = sorted(tmp_path.glob("live-*.mcap"))
     assert [file.name for file in files[:3]] == ["live-001.mcap", "live-002.mcap", "live-003.mcap"]
     seen: Counter[tuple[str, bytes]] = Counter()

@@ -12,7 +12,7 @@ import yaml
 
 from fusion.client import Arena
 from tests.conftest import free_port
-from tests.waiting import wait_for
+from tests.waiting import DEADLINE_S, wait_for
 from tests.web.roundel.programs import Program, roundel, roundel_command
 
 WAND_S = 60.0
@@ -63,7 +63,7 @@ def test_from_unknown_cameras_to_poses_with_two_commands(start, scene: Path, tmp
     children = psutil.Process(up.process.pid).children(recursive=True)
     assert camera.stop() == 0
     assert up.stop() == 0
-    assert not psutil.wait_procs(children, timeout=10.0)[1]
+    assert not psutil.wait_procs(children, timeout=DEADLINE_S)[1]
 
 
 def test_a_camera_keeps_its_name_and_its_settings(start, tmp_path: Path):
