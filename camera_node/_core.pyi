@@ -4,6 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 def distance_by_principal_axis(diameter: float, major: float) -> float: ...
+def disc_pictures(
+    position: NDArray[np.float64], normal: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...  # see `geometry.outline`
 
 class Lens:
     """Intrinsics: fx, fy, cx, cy and up to 12 distortion numbers in OpenCV's order, or 4 of a fisheye."""

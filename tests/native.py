@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-FLAGS = ["-std=c++20", "-O1", "-DROUNDEL_SCALAR", "-ffp-contract=off"]
+SHARED = Path(__file__).parents[1] / "camera_node" / "native"  # whose headers fusion includes, too
+FLAGS = ["-std=c++20", "-O1", "-DROUNDEL_SCALAR", "-ffp-contract=off", f"-I{SHARED}"]
 
 
 def build(
@@ -16,7 +17,7 @@ def build(
 
     def compile_one(source: Path) -> Path:
         made = folder / f"{source.parent.name}_{source.stem}.o"
-        command = ["c++", *FLAGS, f"-I{native}", *flags, "-c", source, "-o", made]
+        command = ["c++", f"-I{native}", *FLAGS, *flags, "-c", source, "-o", made]
         subprocess.run(command, check=True, timeout=300)
         return made
 

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Computes the two poses of a disc that explain its ellipse in one view and its known diameter.
 
+Least squares adjusts each pose to the outer ellipse and to the image of the disc's centre: five parameters for seven
+measurements, whose covariance weights their residuals.
+
 See docs/design/detector_model.md, section 9.
 """
 
@@ -10,15 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node import _core
-from camera_node.detection.disc_adjustment import AdjustedDiscs, adjust, covariance_through, shape_of
 from camera_node.detection.roundels import DetectedRoundels, Roundel, Roundels
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
+from camera_node.geometry.outline import disc_pictures, ellipses_of, half_axes_of
 
 BOUNDARY = 24  # points of an ellipse that are undistorted
 # Mean squared error of small roundels' offsets relative to their covariance, which is of first order (measured).
 SCATTER = 1.5
 AROUND = np.linspace(0, 2 * np.pi, BOUNDARY, endpoint=False)
+STEPS = 4  # Gauss-Newton iterations; the poses from the conic are close to the solution
+MAX_SIGMA = np.pi / 2  # of a normal, radians: nothing is known
+STEP = 0.2  # largest step: of the normal in radians, of the position relative to the distance
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +73,24 @@ class DiscPoses:
         columns = (self.position_m[k], self.normal[k], self.centre_uv[k], self.probability[k])
         first, second = (DiscPose(p, n, uv, float(odds)) for p, n, uv, odds in zip(*columns, strict=True))
         return first, second
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdjustedDiscs:
+    """Adjusted poses of N discs, camera frame.
+
+    Attributes:
+        position, normal: (N, 3).
+        chi2: (N,) weighted sum of squared residuals, with two degrees of freedom.
+        cov: (N, 3, 3) covariance of `position`, squared unit of `position`, to first order.
+        normal_sigma: (N,) standard deviation of `normal` in its least certain direction, radians, to first order.
+    """
+
+    position: Array
+    normal: Array
+    chi2: Array
+    cov: Array
+    normal_sigma: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +194,7 @@ def _locate(ellipses: Array, lens: Lens, diameter_m: float, offsets: _Offsets | 
 def _measure(Q: Array, lens: Lens, ellipses: Array, offsets: _Offsets) -> tuple[Array, Array]:
     """Measurements (N, 7) for `adjust`, and their covariances (N, 7, 7)."""
     centres = lens.normalise(ellipses[:, :2] + offsets.offset_px)
-    shapes = shape_of(np.asarray(np.linalg.inv(Q), float))
+    shapes = ellipses_of(np.asarray(np.linalg.inv(Q), float))
     return np.concatenate([shapes, centres], axis=1), covariance_through(lens, ellipses, offsets.pose_cov)
 
 
@@ -184,12 +208,8 @@ def _adjust(
 
 def _boundaries(ellipses: Array) -> Array:
     """(N, BOUNDARY, 2) points of ellipses (N, 5), raw pixels."""
-    c, s = np.cos(ellipses[:, 4]), np.sin(ellipses[:, 4])
-    along = ellipses[:, 2, None] / 2 * np.cos(AROUND)
-    across = ellipses[:, 3, None] / 2 * np.sin(AROUND)
-    u = c[:, None] * along - s[:, None] * across
-    v = s[:, None] * along + c[:, None] * across
-    return ellipses[:, None, :2] + np.stack([u, v], axis=-1)
+    circle = np.array([np.cos(AROUND), np.sin(AROUND)])
+    return ellipses[:, None, :2] + (half_axes_of(ellipses[:, 2:4], ellipses[:, 4]) @ circle).mT
 
 
 def _fit_conics(xy: Array) -> Array:
@@ -255,3 +275,74 @@ def _axes(Q: Array) -> tuple[Array, Array]:
     level = -(Q[:, 2, 2] + (linear * centre).sum(axis=1))
     minor, major = 2 * np.sqrt(level[:, None] / np.linalg.eigvalsh(Q[:, :2, :2])[:, ::-1]).T
     return minor, major
+
+
+def covariance_through(lens: Lens, ellipses: Array, covariance: Array) -> Array:
+    """Transform covariances of ellipse and disc centre from raw pixels to the normalised image plane.
+
+    `ellipses` are (N, 5) u, v, major, minor, angle and `covariance` (N, 7, 7) is `DetectedRoundels.pose_cov`. The lens
+    is approximated as affine over a roundel. Returns (N, 7, 7).
+    """
+    J = _lens_derivative(lens, ellipses[:, :2])
+    A = _symmetric_root(ellipses)
+    T = np.zeros((len(ellipses), 7, 7))
+    T[:, :2, :2] = T[:, 5:, :2] = T[:, 5:, 5:] = J
+    for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+        dA = np.zeros((2, 2))
+        dA[i, j] = dA[j, i] = 1
+        dS = J @ (dA @ A + A @ dA) @ J.mT
+        T[:, 2:5, 2 + k] = dS[:, [0, 0, 1], [0, 1, 1]]
+    return T @ covariance @ T.mT
+
+
+def _lens_derivative(lens: Lens, uv: Array) -> Array:
+    """(N, 2, 2) derivatives of normalised image coordinates by raw pixels, as differences over one pixel."""
+    half = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+    xy = lens.normalise((uv[:, None] + half).reshape(-1, 2)).reshape(-1, 4, 2)
+    return np.stack([xy[:, 0] - xy[:, 1], xy[:, 2] - xy[:, 3]], axis=-1)
+
+
+def _symmetric_root(ellipses: Array) -> Array:
+    """(N, 2, 2) symmetric matrices A of ellipses centre + A q, |q| = 1."""
+    R = half_axes_of(np.full((len(ellipses), 2), 2.0), ellipses[:, 4])
+    return R @ (ellipses[:, 2:4, None] / 2 * R.mT)
+
+
+def adjust(
+    position: Array, normal: Array, radius: float, measured: Array, covariance: Array
+) -> AdjustedDiscs:
+    """Adjust poses of discs of one radius to measurements by Gauss-Newton.
+
+    Args:
+        position, normal: (N, 3) initial poses, camera frame; returned unchanged where the result is not in front of
+            the camera or faces away from it.
+        radius: outer radius of the discs, in the unit of `position`.
+        measured: (N, 7) the ellipse's centre, S and the disc's centre, in the normalised image plane.
+        covariance: (N, 7, 7) of `measured`.
+    """
+    to_white = np.linalg.inv(np.linalg.cholesky(covariance))
+    c, n = position, normal
+    for _ in range(STEPS):
+        predicted, J, t = disc_pictures(c / radius, n)
+        J = to_white @ J
+        residual = to_white @ (measured - predicted)[..., None]
+        delta = np.linalg.solve(J.mT @ J, J.mT @ residual)[..., 0]
+        delta *= np.minimum(1, STEP / np.abs(delta).max(axis=1, keepdims=True))
+        c = c + np.linalg.norm(c, axis=1, keepdims=True) * delta[:, :3]
+        n = n + (t @ delta[:, 3:, None])[..., 0]
+        n /= np.linalg.norm(n, axis=1, keepdims=True)
+    valid = (c[:, 2:] > 0) & ((n * c).sum(axis=1, keepdims=True) < 0)
+    c, n = np.where(valid, c, position), np.where(valid, n, normal)
+    predicted, J, _ = disc_pictures(c / radius, n)
+    residual = to_white @ (measured - predicted)[..., None]
+    return AdjustedDiscs(c, n, (residual**2).sum(axis=(1, 2)), *_precision(c, to_white @ J))
+
+
+def _precision(c: Array, J: Array) -> tuple[Array, Array]:
+    """Covariances (N, 3, 3) of positions c (N, 3), and standard deviations (N,) of normals.
+
+    `J` are the whitened derivatives (N, 7, 5) of `disc_pictures`.
+    """
+    cov = np.linalg.inv(J.mT @ J)
+    sigma = np.sqrt(np.linalg.eigvalsh(cov[:, 3:, 3:])[:, 1])
+    return (c * c).sum(axis=1)[:, None, None] * cov[:, :3, :3], np.minimum(sigma, MAX_SIGMA)

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The centres of ellipses that are seen through a lens with distortion.
+"""Outlines of discs in the undistorted image plane, and their centres behind a lens with distortion.
+
+The outline of a disc with centre c, unit normal n (camera frame) and radius r is an ellipse with the dual conic
+c c' - r^2 (I - n n') (Hartley and Zisserman 2004, section 8.3); native/numeric/disc_outline.hpp has its equations. The
+ellipse's centre is not the image of the disc's centre.
 
 A lens is not linear across the outline of a disc, so the ellipse that a detector fits to the outline's image has
 another centre than the image of the outline's centre. With the points m + M e of an ellipse, |e| = 1, and their images
@@ -17,6 +21,7 @@ from typing import Protocol
 
 import numpy as np
 
+from camera_node import _core
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
@@ -32,6 +37,30 @@ class RawEllipses(Protocol):
     def axes_px(self) -> Array: ...
     @property
     def angle_rad(self) -> Array: ...
+
+
+def disc_pictures(positions: Array, normals: Array) -> tuple[Array, Array, Array]:
+    """Pictures of N discs in the image plane x/z, y/z, and their derivatives.
+
+    Args:
+        positions: (N, 3) centres over the discs' radii, camera frame.
+        normals: (N, 3) unit vectors, camera frame.
+
+    Returns:
+        pictures: (N, 7) the outline's centre x, y and shape S as xx, xy, yy (its points are centre + S^(1/2) e,
+            |e| = 1), and the image x, y of the disc's centre.
+        J: (N, 7, 5) derivatives by the position, relative to the distance, and by the normal along `tangents`.
+        tangents: (N, 3, 2) two unit vectors perpendicular to the normal and to each other.
+    """
+    return _core.disc_pictures(np.ascontiguousarray(positions, float), np.ascontiguousarray(normals, float))
+
+
+def ellipses_of(dual: Array) -> Array:
+    """Ellipses (..., 5) of dual conics (..., 3, 3): the centre x, y and the shape S as xx, xy, yy."""
+    D = dual / dual[..., 2:, 2:]
+    x, y = D[..., 0, 2], D[..., 1, 2]
+    S = x * x - D[..., 0, 0], x * y - D[..., 0, 1], y * y - D[..., 1, 1]
+    return np.stack([x, y, *S], axis=-1)
 
 
 @np.errstate(all="ignore")  # outlines in messages may be unknown, or anything

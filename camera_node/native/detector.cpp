@@ -51,52 +51,60 @@ Detector::FrameState::FrameState(const ImageView& view, const RoundelLimits& tho
 FrameResult Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
+    // 1. Grey levels in proportion to light, as far as the response of this camera is known.
     const ImageView linear = response_.linearize(image);
-    const bool any = explore();
-    FrameState frame(linear, any ? any_limits_ : limits_);
-    fit_tracked(frame);
-    if (paper_)
-        search_by_paper(frame);
-    else
-        search_by_chords(frame);
-    fit_moving_tracked(frame);
-    fit_moving_streaks(frame);
+    FrameState frame(linear, limits_of_frame());
+    // 2. The roundels of the last frame, at their predicted positions.
+    const std::vector<ExpectedRoundel> lost = fit_tracked(frame);
+    // 3. New ones: local thresholds and chords give seeds, rays from these a conic, the photometric fit the
+    // ellipse, which is verified.
+    std::vector<Box> parts;
+    Candidates candidates;
+    if (paper_) {
+        fit_by_paper(frame);
+    } else {
+        parts = parts_to_search(frame);
+        candidates = find_candidates(frame, parts);
+        n_postponed_ = fit_seeds(candidates.seeds, frame);
+    }
+    // 4. Roundels that moved during the exposure.
+    fit_moving_tracked(lost, frame);
+    fit_moving_streaks(candidates.streaks, frame);
+    // 5. Tracks, and what the next frame needs not search again.
     tracks_.update(frame.found);
     if (paper_)
-        update_theta(frame);
+        update_theta(frame.found);
     else
-        mark_searched(frame);
+        mark_searched(parts, frame.found);
+    // 6. What the roundels show of their prints and of the camera.
     learn_prints(frame);
     learn_camera(frame);
     for (TrackedFit& roundel : frame.found) bend_.claim(roundel.fit);
     return {std::move(frame.found), n_postponed_};
 }
 
-/// Fits the roundels of the last frame: steady ones from their last model, others by rays from their
-/// predicted positions.
-void Detector::fit_tracked(FrameState& frame) const {
-    for (const ExpectedRoundel& expected : tracks_.expect())
-        if (!(expected.steady && fit_and_accept(expected.guess(), expected.track, frame)) &&
-            !fit_and_accept(fit_rays(frame.image, expected.seed, limits_), expected.track, frame))
-            frame.lost.push_back(expected);
-}
-
-/// Decides whether this frame is searched for any print, as the second one is and one in 128 thereafter:
-/// twice the clutter looks like rings of any ratio as of two.
-bool Detector::explore() {
+/// The limits of the prints in use. The second frame and one in 128 thereafter are searched for any print,
+/// since twice the clutter looks like rings of any ratio as of two.
+const RoundelLimits& Detector::limits_of_frame() {
     const bool any = print_ratios_ && explore_in_-- <= 0;
-    chords_.set_limits(any ? any_limits_ : limits_, any);
+    const RoundelLimits& limits = any ? any_limits_ : limits_;
+    chords_.set_limits(limits, any);
     if (any) {
         explore_in_ = kExploreInterval - 1;
         n_frames_ = kSearchInterval;
     }
-    return any;
+    return limits;
 }
 
-void Detector::search_by_chords(FrameState& frame) {
-    frame.parts = parts_to_search(frame);
-    for (const Box& part : frame.parts) search_part(part, frame);
-    fit_seeds(frame);
+/// Fits the roundels of the last frame: steady ones from their last model, others by rays from their
+/// predicted positions. Returns those that it does not find.
+std::vector<ExpectedRoundel> Detector::fit_tracked(FrameState& frame) const {
+    std::vector<ExpectedRoundel> lost;
+    for (const ExpectedRoundel& expected : tracks_.expect())
+        if (!(expected.steady && fit_and_accept(expected.guess(), expected.track, frame)) &&
+            !fit_and_accept(fit_rays(frame.image, expected.seed, limits_), expected.track, frame))
+            lost.push_back(expected);
+    return lost;
 }
 
 /// The parts that changed, except for those under roundels that were found already; a band of the frame if
@@ -135,38 +143,43 @@ static double tile_contrast(double noise, const RoundelLimits& limits) {
     return std::clamp(kNoiseSpan * noise, limits.min_contrast, 255.0);
 }
 
-/// Collects the seeds and streaks of a part.
-void Detector::search_part(const Box& part, FrameState& frame) {
-    const ImageView view = window(frame.image, part);
-    chords_.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
-    const float left = float(part.left), top = float(part.top);
-    for (Seed seed : chords_.seeds()) {
-        seed.x += left;
-        seed.y += top;
-        frame.seeds.push_back(seed);
+/// Searches the parts of the image for the chords of rings, and for the streaks of moving ones.
+Detector::Candidates Detector::find_candidates(const FrameState& frame, const std::vector<Box>& parts) {
+    Candidates candidates;
+    for (const Box& part : parts) {
+        const ImageView view = window(frame.image, part);
+        chords_.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
+        const float left = float(part.left), top = float(part.top);
+        for (Seed seed : chords_.seeds()) {
+            seed.x += left;
+            seed.y += top;
+            candidates.seeds.push_back(seed);
+        }
+        for (Streak streak : chords_.streaks()) {
+            streak.x += left;
+            streak.y += top;
+            candidates.streaks.push_back(streak);
+        }
     }
-    for (Streak streak : chords_.streaks()) {
-        streak.x += left;
-        streak.y += top;
-        frame.streaks.push_back(streak);
-    }
+    return candidates;
 }
 
-/// Fits the seeds. If there are more than the fits allowed, the next frame begins with those that are left.
-void Detector::fit_seeds(FrameState& frame) {
-    const size_t n = frame.seeds.size(), first = size_t(begin_at_ * double(n));
+/// Fits the seeds. Returns how many are left if there are more than the fits allowed: the next frame begins
+/// with those.
+int Detector::fit_seeds(const std::vector<Seed>& seeds, FrameState& frame) {
+    const size_t n = seeds.size(), first = size_t(begin_at_ * double(n));
     const int most = frame.n_fits + kMaxFits;
     size_t done = 0;
     for (; done < n && frame.n_fits < most; ++done) {
-        const Seed& seed = frame.seeds[(first + done) % n];
+        const Seed& seed = seeds[(first + done) % n];
         if (frame.suppression.contains_fast(double(seed.x), double(seed.y))) continue;
         fit_and_accept(fit_rays(frame.image, seed, frame.limits), -1, frame);
     }
-    n_postponed_ = int(n - done);
-    begin_at_ = n_postponed_ ? double((first + done) % n) / double(n) : 0;
+    begin_at_ = done < n ? double((first + done) % n) / double(n) : 0;
+    return int(n - done);
 }
 
-void Detector::search_by_paper(FrameState& frame) {
+void Detector::fit_by_paper(FrameState& frame) {
     const Box part = next_band(frame.image);
     const ImageView view = window(frame.image, part);
     for (InitialGuess guess : paper_->find(view, tile_contrast(frame.noise, limits_), limits_)) {
@@ -176,9 +189,8 @@ void Detector::search_by_paper(FrameState& frame) {
 }
 
 /// Fits lost roundels with motion blur: the fastest ones, if a light that went out took many.
-void Detector::fit_moving_tracked(FrameState& frame) const {
+void Detector::fit_moving_tracked(std::vector<ExpectedRoundel> lost, FrameState& frame) const {
     const auto speed = [](const ExpectedRoundel& e) { return std::hypot(e.vx, e.vy); };
-    auto& lost = frame.lost;
     const auto last = lost.begin() + std::ptrdiff_t(std::min(lost.size(), kMaxLost));
     std::partial_sort(lost.begin(), last, lost.end(),
                       [&](const auto& a, const auto& b) { return speed(a) > speed(b); });
@@ -196,9 +208,9 @@ void Detector::fit_moving_tracked(FrameState& frame) const {
 
 /// Fits new moving roundels at the streaks that match best. A streak in the middle of which the card of
 /// another roundel lies is made by that one's edge.
-void Detector::fit_moving_streaks(FrameState& frame) const {
+void Detector::fit_moving_streaks(const std::vector<Streak>& streaks, FrameState& frame) const {
     std::vector<MovingMatch> matches;
-    for (const Streak& streak : frame.streaks) {
+    for (const Streak& streak : streaks) {
         if (frame.suppression.contains(double(streak.x), double(streak.y), kCardRatio)) continue;
         if (const auto match = matcher_.match_streak(frame.image, streak)) matches.push_back(*match);
     }
@@ -256,20 +268,20 @@ void Detector::learn_response(const std::vector<const RoundelFit*>& clear) {
 }
 
 /// Section III-B of the paper: theta follows the mean levels of the roundels.
-void Detector::update_theta(const FrameState& frame) {
-    if (frame.found.empty()) return paper_->step();
+void Detector::update_theta(const std::vector<TrackedFit>& found) {
+    if (found.empty()) return paper_->step();
     double dark = 0, bright = 0;
-    for (const TrackedFit& roundel : frame.found) {
+    for (const TrackedFit& roundel : found) {
         dark += roundel.fit.dark;
         bright += roundel.fit.bright;
     }
-    paper_->set_levels(dark / double(frame.found.size()), bright / double(frame.found.size()));
+    paper_->set_levels(dark / double(found.size()), bright / double(found.size()));
 }
 
 /// Marks the searched parts, except under roundels and where tracks were lost.
-void Detector::mark_searched(const FrameState& frame) {
-    for (const TrackedFit& roundel : frame.found) change_mask_.mask(roundel.fit.outer);
-    for (const Box& part : frame.parts) change_mask_.mark_searched(part);
+void Detector::mark_searched(const std::vector<Box>& parts, const std::vector<TrackedFit>& found) {
+    for (const TrackedFit& roundel : found) change_mask_.mask(roundel.fit.outer);
+    for (const Box& part : parts) change_mask_.mark_searched(part);
     for (const Ellipse& lost : tracks_.lost()) change_mask_.invalidate(lost);
 }
 
@@ -303,9 +315,7 @@ std::vector<RefusedRing> Detector::explain(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     const ImageView linear = response_.linearize(image);
-    return explain_refusals(
-        linear, {limits_, light_, noise_level(linear), response_.edge_noise(), response_.curvature_sigma(),
-                 response_.correlation(), &response_.remainder()});
+    return explain_refusals(linear, context(limits_, noise_level(linear)));
 }
 
 std::optional<double> Detector::theta() const {

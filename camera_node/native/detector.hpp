@@ -51,34 +51,34 @@ class Detector {
     std::vector<double> found_ratios() const;
 
   private:
-    /// The state of one frame's detection.
+    /// What is found in one frame.
     struct FrameState {
         FrameState(const ImageView& view, const RoundelLimits& limits);
         const ImageView& image;
-        const RoundelLimits& limits;
-        double noise;  // grey levels
+        const RoundelLimits& limits;  // of the prints that this frame is searched for
+        double noise;                 // grey levels
         Suppression suppression;
         std::vector<TrackedFit> found;
         std::vector<RoundelFit> unknown;  // of no print in use
-        std::vector<ExpectedRoundel> lost;
-        std::vector<Box> parts;  // of the image, that are searched
-        std::vector<Seed> seeds;
-        std::vector<Streak> streaks;
         int n_fits = 0;
     };
+    /// Places where roundels may be, in the image's frame.
+    struct Candidates {
+        std::vector<Seed> seeds;
+        std::vector<Streak> streaks;
+    };
 
-    void fit_tracked(FrameState& frame) const;
-    void search_by_paper(FrameState& frame);
-    void search_by_chords(FrameState& frame);
+    const RoundelLimits& limits_of_frame();
+    std::vector<ExpectedRoundel> fit_tracked(FrameState& frame) const;
+    void fit_by_paper(FrameState& frame);
     std::vector<Box> parts_to_search(const FrameState& frame);
     Box next_band(const ImageView& image);
-    void search_part(const Box& part, FrameState& frame);
-    void fit_seeds(FrameState& frame);
-    void fit_moving_tracked(FrameState& frame) const;
-    void fit_moving_streaks(FrameState& frame) const;
-    void update_theta(const FrameState& frame);
-    void mark_searched(const FrameState& frame);
-    bool explore();
+    Candidates find_candidates(const FrameState& frame, const std::vector<Box>& parts);
+    int fit_seeds(const std::vector<Seed>& seeds, FrameState& frame);
+    void fit_moving_tracked(std::vector<ExpectedRoundel> lost, FrameState& frame) const;
+    void fit_moving_streaks(const std::vector<Streak>& streaks, FrameState& frame) const;
+    void update_theta(const std::vector<TrackedFit>& found);
+    void mark_searched(const std::vector<Box>& parts, const std::vector<TrackedFit>& found);
     void learn_prints(const FrameState& frame);
     void use_prints();
     void learn_camera(const FrameState& frame);
@@ -86,15 +86,16 @@ class Detector {
 
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
-    AcceptanceContext context(const FrameState& frame) const {
-        return {frame.limits,
+    AcceptanceContext context(const RoundelLimits& limits, double noise) const {
+        return {limits,
                 light_,
-                frame.noise,
+                noise,
                 response_.edge_noise(),
                 response_.curvature_sigma(),
                 response_.correlation(),
                 &response_.remainder()};
     }
+    AcceptanceContext context(const FrameState& frame) const { return context(frame.limits, frame.noise); }
 
     RoundelLimits limits_, any_limits_;
     std::optional<PrintRatios> print_ratios_;  // if they were not given

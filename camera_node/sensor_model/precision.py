@@ -12,6 +12,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
+from camera_node.geometry.outline import disc_pictures
 from camera_node.geometry.pose import skew
 from camera_node.sensor_model.imaging import Imaging
 from camera_node.sensor_model.operational_space import Pattern
@@ -186,16 +187,15 @@ def _across_edge(blur_px: Array, dark_px: Array, bright_px: Array) -> Array:
 def _ellipse_centre_jacobian(lens: Lens, radius: float, position: Array, frame: Array) -> Array:
     """(N, 2, 5) derivative of the outer ellipse's centre by position and by rotations of the normal about e1 and e2.
 
-    The centre is the projection of q = c + r^2 / c_z (n_z n - e_z); see docs/design/fusion_filter.md, section 3.
+    In the image plane `disc_pictures` has the derivatives, by the normal along two other directions across it.
     """
-    n, z = frame[:, :, 2], np.array([0.0, 0.0, 1.0])
-    lift = (radius**2 / position[:, 2])[:, None]
-    s = lift * (n[:, 2:] * n - z)
-    by_position = np.eye(3) - (s / position[:, 2:])[:, :, None] * z
-    by_normal = lift[..., None] * (n[:, :, None] * z + n[:, 2, None, None] * np.eye(3))
-    by_turn = by_normal @ -skew(n) @ frame[:, :, :2]
-    J = lens.project_with_jacobian(position + s)[1]
-    return J @ np.concatenate([by_position, by_turn], axis=2)
+    pictures, J, tangents = disc_pictures(position / radius, frame[:, :, 2])
+    by_position = J[:, :2, :3] / np.linalg.norm(position, axis=1)[:, None, None]
+    turned = -skew(frame[:, :, 2]) @ frame[:, :, :2]  # changes (N, 3, 2) of the normal
+    by_turn = J[:, :2, 3:] @ tangents.mT @ turned
+    centre = np.column_stack([pictures[:, :2], np.ones(len(pictures))])
+    J_lens = lens.project_with_jacobian(centre)[1][:, :, :2]
+    return J_lens @ np.concatenate([by_position, by_turn], axis=2)
 
 
 def _summarize(cov: Array, position: Array, J: Array, to_ellipse: Array) -> PredictedPrecision:

@@ -13,14 +13,10 @@ constexpr double kGrazing = 0.1;     // smallest cosine of viewing direction and
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 constexpr double kTinyPx2 = 1e-6;  // lower bound of a squared half axis, for discs closer than their radius
 
-/// A symmetric 2 x 2 covariance in the undistorted plane.
-struct Covariance2 {
-    double xx, xy, yy;
-};
-
+/// A detection in the undistorted plane.
 struct Detection {
     double x, y, delay;
-    Covariance2 noise;
+    Symmetric noise;
     int64_t index;
 };
 
@@ -48,21 +44,17 @@ Matrix cross_covariance(const double* P, const Displacement& u, const Displaceme
 }
 
 /// The covariance of detection `k` including the calibration error, in the undistorted plane.
-Covariance2 noise_of(const Detections& detections, size_t k) {
-    const Scale s = Scale::of(detections.scale, k);
-    const double p = detections.cov.at(0, k) + kSlackPx * kSlackPx, q = detections.cov.at(1, k),
-                 r = detections.cov.at(3, k) + kSlackPx * kSlackPx;
-    const double det = s.ux * s.vy - s.uy * s.vx, per = 1 / (det * det);
-    return {per * (s.vy * s.vy * p - 2 * s.vy * s.uy * q + s.uy * s.uy * r),
-            per * ((s.ux * s.vy + s.uy * s.vx) * q - s.vx * s.vy * p - s.ux * s.uy * r),
-            per * (s.vx * s.vx * p - 2 * s.vx * s.ux * q + s.ux * s.ux * r)};
+Symmetric noise_of(const Detections& detections, size_t k) {
+    const Symmetric pixels{detections.cov.at(0, k) + kSlackPx * kSlackPx, detections.cov.at(1, k),
+                           detections.cov.at(3, k) + kSlackPx * kSlackPx};
+    return mapped(scale_at(detections.scale, k).inverse(), pixels);
 }
 
 /// The predicted view of a marker in one frame, and its covariance.
 struct ExpectedView {
     DiscView at;
     double radius;
-    Covariance2 covariance;
+    Symmetric covariance;
     double log_size_variance;
     double vx;  // of the image, 1/s: a row captured later shows the marker farther along
     double vy;  // of the image, 1/s
@@ -73,7 +65,7 @@ class FrameDetections {
   public:
     FrameDetections(const Detections& detections, size_t first, size_t last) {
         for (size_t k = first; k < last; ++k) {
-            const Covariance2 noise = noise_of(detections, k);
+            const Symmetric noise = noise_of(detections, k);
             if (!std::isfinite(detections.xy.at(0, k) + noise.xx + noise.yy)) continue;
             sorted_.push_back(
                 {detections.xy.at(0, k), detections.xy.at(1, k), detections.delay[k], noise, int64_t(k)});
@@ -131,12 +123,12 @@ double major_axis(const DiscView& view, double radius, const Scale& scale) {
 double cost(const ExpectedView& expected, const Detection& detection, const Detections& all, double focal) {
     const double u = detection.x - expected.at.x - detection.delay * expected.vx;
     const double v = detection.y - expected.at.y - detection.delay * expected.vy;
-    const Covariance2 &P = expected.covariance, &N = detection.noise;
+    const Symmetric &P = expected.covariance, &N = detection.noise;
     const double xx = P.xx + N.xx, xy = P.xy + N.xy, yy = P.yy + N.yy, det = xx * yy - xy * xy;
     const double d2 = (yy * u * u - 2 * xy * u * v + xx * v * v) / det;
     if (!(d2 < kGate)) return kInfinity;
     const size_t k = detection.index;
-    const double predicted = major_axis(expected.at, expected.radius, Scale::of(all.scale, k));
+    const double predicted = major_axis(expected.at, expected.radius, scale_at(all.scale, k));
     const double log_ratio = std::log(all.major[k] / predicted);  // NaN where the size is unknown
     if (std::abs(log_ratio) > std::log(kSizeRatio)) return kInfinity;
     const double size_cost = std::isfinite(log_ratio) ? square(log_ratio) / expected.log_size_variance : 0;

@@ -3,9 +3,12 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "geometry.hpp"
+#include "numeric/vector3.hpp"
 
 namespace roundel::fusion {
+
+using Vector = Vector3;
+using Matrix = Matrix3;
 
 /// A view of N columns of R numbers, stored row after row: a NumPy array (R, N) in C order.
 template <int R>

@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "geometry.hpp"
+#include "columns.hpp"
 
 namespace roundel::fusion {
 

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #include "disc_view.hpp"
 
+#include "numeric/disc_outline.hpp"
+
 namespace roundel::fusion {
 
 BodyInCamera transform(const Body& body, const Exposure& exposure) {
@@ -12,8 +14,7 @@ BodyInCamera transform(const Body& body, const Exposure& exposure) {
 
 DiscView view_disc(const BodyInCamera& body, const DiscOnBody& disc) {
     const Vector c = body.t_cam + body.R_cam * disc.position, n = body.R_cam * disc.normal;
-    const double size = disc.radius * disc.radius / c.z;
-    const Vector q = c + (size * n.z) * n - Vector{0, 0, size};
+    const Vector q = outline_centre(c, n, disc.radius);
     const double z = c.z > kNearM ? q.z : std::numeric_limits<double>::quiet_NaN();
     return {c, n, q, q.x / z, q.y / z};
 }

@@ -6,12 +6,7 @@
 
 #include "columns.hpp"
 
-/// Projects discs into cameras, in the undistorted image plane x/z, y/z.
-///
-/// The outline of a disc with centre c, unit normal n (camera frame) and radius r has the dual conic
-/// C* = c c^T - r^2 (I - n n^T): a disc is a flattened quadric (Hartley and Zisserman 2004, section 8.3).
-/// The centre of the outline is C* e_z, the projection of q = c + r^2 / c_z (n_z n - e_z). It differs from
-/// the projection of c.
+/// Projects discs into cameras, in the undistorted image plane x/z, y/z; see numeric/disc_outline.hpp.
 namespace roundel::fusion {
 
 constexpr double kNearM = 1e-3;  // discs with a smaller depth are not visible
@@ -45,7 +40,7 @@ struct DiscOnBody {
     double radius;
 };
 
-/// A projected disc; see above. `x` and `y` are the centre of the outline, NaN where the disc is behind the
+/// A projected disc: `q` is its `outline_centre`, and `x` and `y` its image, NaN where the disc is behind the
 /// camera.
 struct DiscView {
     Vector centre, normal, q;

@@ -96,7 +96,7 @@ void linearize(const FramePoses& poses, const OutlineObservations& observed, Equ
         to[k] = {};
         const Shape measured =
             measured_outline(observed.axes.at(0, k), observed.axes.at(1, k), observed.angle[k]);
-        const Scale scale = Scale::of(observed.scale, k);
+        const Scale scale = scale_at(observed.scale, k);
         const auto shear_at = [&](const Vector& normal) {
             return shear(measured, outline(expected.centre, normal, discs.radius[k], scale));
         };

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include "disc_view.hpp"
-#include "normal_equations.hpp"
+#include "reweighting.hpp"
 
 namespace roundel::fusion {
 

@@ -1,23 +1,20 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include "disc_view.hpp"
+#include "numeric/ellipse.hpp"
 
 namespace roundel::fusion {
 
-/// A symmetric matrix [xx xy; xy yy]. The shape matrix of a circle of radius a is a^2 I.
-struct Shape {
-    double xx, xy, yy;
-};
+/// The shape matrix of an ellipse; that of a circle of radius a is a^2 I.
+using Shape = Symmetric;
 
 /// The Jacobian of raw pixels with respect to undistorted coordinates. The lens is taken as affine over an
 /// outline.
-struct Scale {
-    double ux, uy, vx, vy;
+using Scale = LinearMap;
 
-    static Scale of(const Columns<4>& scales, size_t k) {
-        return {scales.at(0, k), scales.at(1, k), scales.at(2, k), scales.at(3, k)};
-    }
-};
+inline Scale scale_at(const Columns<4>& scales, size_t k) {
+    return {scales.at(0, k), scales.at(1, k), scales.at(2, k), scales.at(3, k)};
+}
 
 /// The shape matrix of the outline of a disc, raw pixels, from its dual conic.
 Shape outline(const Vector& centre, const Vector& normal, double radius, const Scale& scale);

@@ -3,7 +3,7 @@
 
 #include <algorithm>
 
-#include "../../camera_node/native/numeric/simd.hpp"
+#include "numeric/simd.hpp"
 
 namespace roundel::fusion {
 namespace {

@@ -17,7 +17,7 @@ from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_mark
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.outline import centre_shifts, half_axes_of
+from camera_node.geometry.outline import centre_shifts, disc_pictures, half_axes_of
 from camera_node.geometry.sphere import fibonacci_sphere
 
 DIRECTIONS = 160  # on a sphere, tried before refinement: 9 degrees apart
@@ -72,19 +72,15 @@ def centre_offsets(
 def displacement(lens: Lens, points: Array, normals: Array, radius: float) -> Array:
     """(n, 2) pixels from the projections of discs' centres to their ellipses' centres.
 
-    The outline of a disc with centre c and normal n has the dual conic c c' - r^2 (I - n n') in the image plane, whose
-    last column is the ellipse's centre (Hartley and Zisserman, sections 2.2.3 and 8.3). Divided by its last element it
-    is m m' - S, where S is the shape of an ellipse with centre m, which the lens maps to another one (`centre_shifts`).
+    The outline in the image plane is an ellipse (`disc_pictures`), which the lens maps to another one
+    (`centre_shifts`).
 
     Args:
         points, normals: (n, 3) centres, metres, and unit normals, camera frame.
         radius: metres.
     """
-    across = np.eye(3) - normals[:, :, None] * normals[:, None]
-    dual = points[:, :, None] * points[:, None] - radius**2 * across
-    dual = dual / dual[:, 2:, 2:]
-    centre = dual[:, :2, 2]
-    shape = centre[:, :, None] * centre[:, None] - dual[:, :2, :2]
+    pictures = disc_pictures(points / radius, normals)[0]
+    centre, shape = pictures[:, :2], pictures[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     uv = lens.project(np.column_stack([centre, np.ones(len(centre))]))
     return uv + centre_shifts(lens, centre, _root(shape)) - lens.project(points)
 

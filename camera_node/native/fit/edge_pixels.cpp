@@ -7,12 +7,72 @@
 #include <numbers>
 #include <span>
 
-#include "fit/row_spans.hpp"
 #include "numeric/simd.hpp"
 
 namespace roundel {
 
 namespace {
+
+constexpr int kNowhere = INT32_MIN / 2;
+
+ROUNDEL_INLINE Bits floor_of(const Lanes& x) {
+    const Bits near = __builtin_convertvector(x, Bits);
+    return near + (__builtin_convertvector(near, Lanes) > x);  // a comparison that is true is -1
+}
+
+/// An ellipse in a form that makes its intersection with a row cheap; its height is negative if it is empty.
+struct RowEllipse {
+    float x = 0, y = 0, per_height = 1e6f, width = 0, lean = 0;
+    double top = 1e9, bottom = -1e9;
+
+    RowEllipse() = default;
+    /// `e` with both half axes a and b longer by `more`; empty if one vanishes.
+    RowEllipse(const CircleImage& e, double more) {
+        const double ab = std::sqrt(std::max(e.shape.det(), 0.0)),
+                     sum = std::sqrt(e.shape.xx + e.shape.yy + 2 * ab);
+        const double product = ab + more * (sum + more);  // (a + more) (b + more)
+        if (!(product > 0 && sum + 2 * more > 0)) return;
+        // (S^(1/2) + more)^2, where S^(1/2) = (S + a b) / (a + b)
+        const double scale = 1 + 2 * more / sum, yy = scale * e.shape.yy + more * (2 * ab / sum + more);
+        const double height = std::sqrt(yy);
+        x = float(e.x);
+        y = float(e.y);
+        per_height = float(1 / height);
+        width = float(product / height);
+        lean = float(scale * e.shape.xy / yy);
+        top = e.y - height;
+        bottom = e.y + height;
+    }
+};
+
+/// The columns [begin, end) inside of an ellipse.
+struct Spans {
+    Bits begin, end;
+    bool has(int k) const { return begin[k] < end[k]; }
+};
+
+/// Eight ellipses, each cut by its own row.
+struct RowEllipses {
+    Lanes x, y, per_height = all(1e6f), width, lean;
+    void set(int k, const RowEllipse& e) {
+        x[k] = e.x;
+        y[k] = e.y;
+        per_height[k] = e.per_height;
+        width[k] = e.width;
+        lean[k] = e.lean;
+    }
+    static RowEllipses all_of(const RowEllipse& o) {
+        return {all(o.x), all(o.y), all(o.per_height), all(o.width), all(o.lean)};
+    }
+    ROUNDEL_INLINE Spans cut(const Lanes& rows) const {
+        const Lanes dy = rows - y, t = dy * per_height, left = 1.0f - t * t;
+        const Bits inside = left > 1e-6f;
+        const Lanes share = inside ? left : all(1), half = width * share * inverse_sqrt(share);
+        const Lanes middle = x + lean * dy;
+        return {inside ? -floor_of(half - middle) : Bits{} + kNowhere,
+                inside ? floor_of(middle + half) + 1 : Bits{} + kNowhere};
+    }
+};
 
 constexpr int kMinRows = 10;         // fewer do not determine an ellipse
 constexpr int kWideRows = 3;         // every third row uses the wide band
@@ -195,6 +255,80 @@ ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& car
     }
 }
 
+constexpr double kMostPixels = 4000;  // of the disc: levels are then known to a thirtieth of the noise
+
+/// Sums of levels and of their squares, below 2^31 for 30,000 pixels.
+struct LevelSums {
+    int count = 0, sum = 0, squares = 0;
+    Bits sums{};        // `sum` by lanes
+    Bits squares_of{};  // `squares` by lanes
+
+    ROUNDEL_INLINE void add(const uint8_t* levels) {
+        uint64_t bytes;
+        __builtin_memcpy(&bytes, levels, sizeof bytes);
+        const Bits level = widen(bytes);
+        sums += level;
+        squares_of += level * level;
+    }
+    Plateau mean() const {
+        if (count == 0) return {};
+        int64_t total = sum, of_squares = squares;
+        for (int k = 0; k < kLanes; ++k) {
+            total += sums[k];
+            of_squares += squares_of[k];
+        }
+        const double m = double(total) / count;
+        return {count, m, double(of_squares) / count - m * m};
+    }
+};
+
+/// The rows of an image, relative to the origin of the parameters.
+struct Rows {
+    const ImageView& image;
+    int origin_x, origin_y;
+
+    /// Adds the pixels [begin, end) of row y that are inside the image.
+    ROUNDEL_INLINE void add(int y, int begin, int end, LevelSums& sums) const {
+        if (y + origin_y < 0 || y + origin_y >= image.height) return;
+        begin = std::max(begin + origin_x, 0);
+        end = std::min(end + origin_x, image.width);
+        const uint8_t* row = image.row(y + origin_y);
+        int u = begin;
+        for (; u + kLanes <= end; u += kLanes) sums.add(row + u);
+        for (; u < end; ++u) {
+            sums.sum += row[u];
+            sums.squares += row[u] * row[u];
+        }
+        sums.count += std::max(0, end - begin);
+    }
+};
+
+/// The ellipses between which the plateaus lie, from the outside.
+struct PlateauEdges {
+    RowEllipse ring, around_hole, hole;
+};
+
+ROUNDEL_CLONES void add_up(const Rows& image, const PlateauEdges& edges, int step, LevelSums& ring,
+                           LevelSums& hole) {
+    const RowEllipses outer = RowEllipses::all_of(edges.ring),
+                      middle = RowEllipses::all_of(edges.around_hole),
+                      inner = RowEllipses::all_of(edges.hole);
+    constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
+    const int top = int(std::ceil(edges.ring.top)), bottom = int(std::floor(edges.ring.bottom));
+    for (int y = top; y <= bottom; y += kLanes * step) {
+        const Lanes rows = float(y) + float(step) * kSteps;
+        const Spans whole = outer.cut(rows), open = middle.cut(rows), paper = inner.cut(rows);
+        for (int k = 0; k < kLanes; ++k) {
+            const int row = y + k * step;
+            if (!whole.has(k)) continue;
+            const bool is_open = open.has(k);
+            image.add(row, whole.begin[k], is_open ? open.begin[k] : whole.end[k], ring);
+            if (is_open) image.add(row, open.end[k], whole.end[k], ring);
+            if (paper.has(k)) image.add(row, paper.begin[k], paper.end[k], hole);
+        }
+    }
+}
+
 }  // namespace
 
 void EdgePixels::sample(int n, EdgePixels& to) const {
@@ -229,6 +363,17 @@ void select_pixels(const ImageView& image, const Parameters& p, const EdgeBand& 
     if (separate) return append_edges(image, edges, clearance, band, step, pixels);
     append_rows(image, narrow, wide, step, pixels);
     pixels.end_part(kAnyEdge);
+}
+
+Plateaus read_plateaus(const ImageView& image, const Parameters& p, int origin_x, int origin_y,
+                       double distance) {
+    const CircleImage outer = circle_image(p, 1), inner = circle_image(p, p[kRatio]);
+    const PlateauEdges edges{RowEllipse(outer, -distance), RowEllipse(inner, distance),
+                             RowEllipse(inner, -distance)};
+    const double area = std::numbers::pi * std::sqrt(std::max(0.0, outer.shape.det()));
+    LevelSums ring, hole;
+    add_up({image, origin_x, origin_y}, edges, 1 + int(area / kMostPixels), ring, hole);
+    return {ring.mean(), hole.mean()};
 }
 
 }  // namespace roundel

@@ -22,7 +22,10 @@ struct PixelColumns {
     /// Pads the columns to whole lanes.
     void pad() {
         count = (used + kLanes - 1) / kLanes * kLanes;
-        for (int k = used; k < count; ++k) x[k] = y[k] = 0, level[k] = -1;
+        for (int k = used; k < count; ++k) {
+            x[k] = y[k] = 0;
+            level[k] = -1;
+        }
     }
 };
 
@@ -80,5 +83,21 @@ void select_pixels(const ImageView& image, const Parameters& p, const EdgeBand& 
 
 /// The mean level of the pixels beyond the card's edge; the bright level if there are none.
 double level_beyond_card(const EdgePixels& pixels, const Parameters& p);
+
+/// The grey levels of a part of a roundel that no edge reaches.
+struct Plateau {
+    int count = 0;
+    double mean = 0, variance = 0;
+};
+
+struct Plateaus {
+    Plateau ring, hole;
+};
+
+/// Reads the ring and the hole at `distance` pixels or more from their edges, in every row of a disc of
+/// up to 70 pixels and in fewer rows of larger ones. (`origin_x`, `origin_y`) is the pixel to which the
+/// parameters are relative.
+Plateaus read_plateaus(const ImageView& image, const Parameters& p, int origin_x, int origin_y,
+                       double distance);
 
 }  // namespace roundel

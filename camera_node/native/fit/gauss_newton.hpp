@@ -18,14 +18,13 @@ constexpr double kPatch = 64;           // pixels of the ground with correlated 
 /// The parameters of an initial guess, in a frame with its origin at pixel (x, y). A is the symmetric square
 /// root that maps the unit circle to the ellipse.
 inline Parameters initial_parameters(const InitialGuess& guess, int origin_x, int origin_y, double blur) {
-    const double c = std::cos(guess.outer.angle), n = std::sin(guess.outer.angle);
-    const double a = guess.outer.major / 2, b = guess.outer.minor / 2;
+    const Symmetric A = from_eigenvalues(guess.outer.major / 2, guess.outer.minor / 2, guess.outer.angle);
     Parameters p{};
     p[kX] = guess.outer.x - origin_x;
     p[kY] = guess.outer.y - origin_y;
-    p[kAxx] = a * c * c + b * n * n;
-    p[kAxy] = (a - b) * c * n;
-    p[kAyy] = a * n * n + b * c * c;
+    p[kAxx] = A.xx;
+    p[kAxy] = A.xy;
+    p[kAyy] = A.yy;
     p[kRatio] = guess.ratio;
     p[kCard] = kCardRatio;
     p[kBlur] = blur;

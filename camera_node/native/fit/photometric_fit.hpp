@@ -132,4 +132,8 @@ struct GroundFits {
 };
 std::optional<GroundFits> fit_on_ground(const ImageView& image, const InitialGuess& guess);
 
+/// The result of a fit, in the image's frame. `p` are its parameters in a frame with its origin at pixel
+/// (origin_x, origin_y), and `pose` is the covariance of their last kPoseCount.
+RoundelFit make_fit(const Parameters& p, const PoseCovariance& pose, int origin_x, int origin_y);
+
 }  // namespace roundel

@@ -29,20 +29,13 @@ struct NormalisedMeasurement {
 };
 
 /// The symmetric root A of the ellipse's shape.
-Symmetric root_of(const Ellipse& e) {
-    const double c = std::cos(e.angle), s = std::sin(e.angle), a = e.major / 2, b = e.minor / 2;
-    return {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c};
-}
+Symmetric root_of(const Ellipse& e) { return from_eigenvalues(e.major / 2, e.minor / 2, e.angle); }
 
 /// The derivative of S = J A A J^T by one of the numbers of A, dA.
 Symmetric shape_derivative(const LinearMap& J, const Symmetric& A, const Symmetric& dA) {
     const double xx = 2 * (dA.xx * A.xx + dA.xy * A.xy), yy = 2 * (dA.xy * A.xy + dA.yy * A.yy);
     const double xy = dA.xx * A.xy + dA.xy * A.yy + A.xx * dA.xy + A.xy * dA.yy;
-    const auto product = [&](double ux, double uy, double vx, double vy) {
-        return ux * xx * vx + xy * (ux * vy + uy * vx) + uy * yy * vy;
-    };
-    return {product(J.xx, J.xy, J.xx, J.xy), product(J.xx, J.xy, J.yx, J.yy),
-            product(J.yx, J.yy, J.yx, J.yy)};
+    return mapped(J, {xx, xy, yy});
 }
 
 /// The derivative of the normalised measurement, with the lens approximated as linear over the roundel.

@@ -3,22 +3,17 @@
 #include <array>
 #include <optional>
 
+#include "numeric/ellipse.hpp"
+
 namespace roundel {
 
 struct Point {
     double x, y;
 };
 
-/// A linear map of the plane: rows (xx, xy) and (yx, yy).
-struct LinearMap {
-    double xx, xy, yx, yy;
-    Point operator*(Point p) const { return {xx * p.x + xy * p.y, yx * p.x + yy * p.y}; }
-    double det() const { return xx * yy - xy * yx; }
-    LinearMap inverse() const {
-        const double d = det();
-        return {yy / d, -xy / d, -yx / d, xx / d};
-    }
-};
+inline Point operator*(const LinearMap& L, Point p) {
+    return {L.xx * p.x + L.xy * p.y, L.yx * p.x + L.yy * p.y};
+}
 
 /// Intrinsics in OpenCV's models: pinhole with k1, k2, p1, p2, k3 to k6, s1 to s4, or `cv2.fisheye` with k1
 /// to k4 (Kannala and Brandt 2006). `camera_node.geometry.lens` is the reference.

@@ -87,7 +87,7 @@ Out shears_of(const Pairs& axes, const Numbers& angle, const Vectors& centre, co
     for (size_t k = 0; k < n; ++k) {
         const Shape measured = measured_outline(axes(0, k), axes(1, k), angle(k));
         const Shape expected =
-            outline(c.vector(k), d.vector(k), radius(k), Scale::of(columns<4>(scale, n), k));
+            outline(c.vector(k), d.vector(k), radius(k), scale_at(columns<4>(scale, n), k));
         const Shear s = shear(measured, expected);
         to[k] = s.along;
         to[n + k] = s.across;

@@ -24,8 +24,8 @@ def includes(native: Path) -> list[tuple[Path, Path]]:
     pairs = []
     for source in sorted(native.rglob("*.[ch]pp")):
         for name in re.findall(r'^#include "(.+)"', source.read_text(), re.MULTILINE):
-            near = source.parent / name
-            pairs.append((source, (near if near.exists() else native / name).resolve()))
+            places = [folder / name for folder in (source.parent, native, CAMERA_NODE)]
+            pairs.append((source, next((p for p in places if p.exists()), places[0]).resolve()))
     return pairs
 
 

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: BSD-3-Clause
-#include "normal_equations.hpp"
+#include "reweighting.hpp"
 
 #include <algorithm>
 #include <numeric>
 #include <span>
 #include <stdexcept>
 
-#include "../../camera_node/native/numeric/cholesky.hpp"
-#include "../../camera_node/native/numeric/simd.hpp"
+#include "numeric/cholesky.hpp"
+#include "numeric/simd.hpp"
 
 namespace roundel::fusion {
 namespace {
