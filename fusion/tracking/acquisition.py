@@ -54,22 +54,6 @@ class Acquired:
     crowded: Index
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    """Robots at their states, with the assignments that support these."""
-
-    rows: Index
-    states: States
-    assignments: Assignments
-
-    def joined(self, fits: RefinedFits) -> "_Found":
-        return _Found(
-            np.concatenate([self.rows, fits.robot]),
-            self.states.joined(fits.states),
-            self.assignments.joined(fits.assignments),
-        )
-
-
 class Acquisition:
     """Acquires robots of a track table.
 
@@ -110,15 +94,17 @@ class Acquisition:
         n_missing = int(np.isin(table.markers.robot, missing).sum())
         markers, crowded = self._markers.find(table.markers, n_missing, detections, of_bodies)
         found, reasons = self._acquire_bodies(table, bodies, markers, detections, of_bodies)
-        of_bodies = of_bodies.joined(found.assignments)
+        of_bodies = of_bodies.joined(*(fits.assignments for fits in found))
         displaced = np.unique(of_singles.marker[np.isin(of_singles.detection, of_bodies.detection)])
         assignments = of_bodies.joined(of_singles.select(~np.isin(of_singles.marker, displaced)))
         markers = _without(markers, assignments)
         choice = choose_markers(table, singles, markers, histories)
         more = self._acquire_singles(table, choice, markers, detections)
+        none = table.states.select(missing[:0])
+        states = none.joined(*(fits.states for fits in found), more.states)
         return Acquired(
-            np.concatenate([found.rows, more.robot]),
-            found.states.joined(more.states),
+            np.concatenate([*(fits.robot for fits in found), more.robot]),
+            states,
             table.markers.robot[displaced],
             assignments.joined(more.assignments),
             _without(markers, more.assignments),
@@ -133,11 +119,10 @@ class Acquisition:
         markers: list[Marker],
         detections: DetectionTable,
         assignments: Assignments,
-    ) -> tuple[_Found, dict[int, str]]:
+    ) -> tuple[list[RefinedFits], dict[int, str]]:
         """The constellations of this shard that the markers identify, and why the others are not among them."""
-        none = _Found(missing[:0], table.states.select(missing[:0]), Assignments.none())
         if not len(missing):
-            return none, {}
+            return [], {}
         turn = self._turn
         rows = np.roll(missing, -int(np.searchsorted(missing, turn)))[:MAX_BODIES]
         robots = {row: table.robots[row] for row in rows.tolist()}
@@ -152,12 +137,11 @@ class Acquisition:
         self._turn = identified.turn
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
-        found = none
         n_frame_sets, t_ns = self._markers.n_frame_sets, table.t_ns or 0
         confirmed = self._weak.confirm(identified.weak, t_ns, n_frame_sets)
-        for fits in (*identified.fits, *confirmed):
-            found = found.joined(fits.select(table.owned[fits.robot]))
-        left = missing[table.owned[missing] & ~np.isin(missing, found.rows)].tolist()
+        found = [fits.select(table.owned[fits.robot]) for fits in (*identified.fits, *confirmed)]
+        acquired = {k for fits in found for k in fits.robot.tolist()}
+        left = [k for k in missing[table.owned[missing]].tolist() if k not in acquired]
         return found, {k: _reason(table, k, question, identified) for k in left}
 
     def _acquire_singles(

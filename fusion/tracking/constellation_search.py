@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Finds where the distances and the visibility of triangulated markers allow constellations to be."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.foundation.columns import Columns
 from camera_node.geometry.pose import rigid_motions
 from fusion import _core
 from fusion.model.likeness import MIN_MARKERS, distances
@@ -56,7 +56,7 @@ class TriangulatedMarkers:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mappings:
+class Mappings(Columns):
     """K mappings, each of L markers of a robot to points.
 
     Attributes:
@@ -69,28 +69,14 @@ class Mappings:
     numbers: Index
     points: Index
 
-    def __len__(self) -> int:
-        return len(self.robot)
-
-    def select(self, rows: NDArray) -> "Mappings":
-        """The rows of a mask or an index array."""
-        return Mappings(self.robot[rows], self.numbers[rows], self.points[rows])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fits:
+class Fits(Columns):
     """K mappings with the poses R (K, 3, 3), t (K, 3) of the robots that fit best, world frame."""
 
     mappings: Mappings
     R: Array
     t: Array
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def select(self, rows: NDArray) -> "Fits":
-        """The rows of a mask or an index array."""
-        return Fits(self.mappings.select(rows), self.R[rows], self.t[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +95,7 @@ class Candidates:
         """The mappings of `count` markers."""
         parts = [_with_markers(robot, table, count) for robot, table in self.tables.items()]
         none = np.empty((0, count), np.intp)
-        parts = [Mappings(none[:, 0], none, none), *parts]
-        return Mappings(
-            *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Mappings))
-        )
+        return Mappings(none[:, 0], none, none).joined(*parts)
 
 
 def search(robots: dict[int, Robot], scene: TriangulatedMarkers) -> Candidates:

@@ -5,11 +5,13 @@ Cameras that do not expose at once see a moving marker at several places. A grou
 velocity together with the prior of the velocity, and predicts the marker for the time of any other ray.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.foundation.columns import Columns
 from fusion import _core
 from fusion.model.observations import CameraArray, DetectionTable, Exposures
 from fusion.tracking.gating import DIAMETER_TOLERANCE, MAX_SPEED_M_S
@@ -20,7 +22,7 @@ FAR_M = 50.0  # largest range of a ray without a size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rays:
+class Rays(Columns):
     """Viewing rays of N detections of one frame set.
 
     Attributes:
@@ -33,6 +35,8 @@ class Rays:
         ranges: (N, K, 2) smallest and largest range at which the size suits each of K marker diameters.
     """
 
+    SHARED: ClassVar[frozenset[str]] = frozenset({"exposures", "centres"})
+
     o: Array
     d: Array
     sigma: Array
@@ -43,15 +47,6 @@ class Rays:
     ranges: Array
     exposures: Exposures
     centres: Array
-
-    def __len__(self) -> int:
-        return len(self.d)
-
-    def select(self, rows: Index) -> "Rays":
-        """Some of the rays."""
-        whole = ("exposures", "centres")
-        by_ray = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in whole}
-        return Rays(**by_ray, exposures=self.exposures, centres=self.centres)
 
     @property
     def viewpoints(self) -> _core.Viewpoints:
