@@ -19,6 +19,7 @@ from camera_node.geometry.pose import Pose, invert, look_at, rotation_from_vecto
 from camera_node.protocol.messages import Detections
 
 WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
+STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
 PERIOD_NS = 100_000_000
 RIM = 16  # points of a disc's rim
 # Standard deviations of lens errors: relative focal length, principal point in pixels, k1.

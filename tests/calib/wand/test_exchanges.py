@@ -9,9 +9,8 @@ from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.mishaps import repack
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
-from tests.calib.synthetic import camera_errors
+from tests.calib.synthetic import STICK, camera_errors
 
-STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
 LIGHT = Body(diameter_m=0.05)
 SHARE, FRAMES = 0.2, 240
 

@@ -65,9 +65,10 @@ def of(name: str, change: Change, messages: list[Detections]) -> list[Detections
 )
 def test_a_camera_that_is_not_placed_has_a_reason(change: Change, reason: str):
     arena = ring()
-    report = calibrate(arena.intrinsics, WAND, of("cam3", change, numbered())).report
-    assert list(report.unplaced) == ["cam3"]
-    assert re.search(reason, report.unplaced["cam3"])
+    result = calibrate(arena.intrinsics, WAND, of("cam3", change, numbered()))
+    assert list(result.report.unplaced) == ["cam3"]
+    assert re.search(reason, result.report.unplaced["cam3"])
+    assert list(result.rig.placed()) == ["cam0", "cam1", "cam2"]
 
 
 def swapped(cameras: int, first: str, second: str) -> Rig:

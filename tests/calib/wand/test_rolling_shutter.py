@@ -12,11 +12,9 @@ from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.wand_report import WandCalibration
-from camera_node.geometry.body import Body
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
-from tests.calib.synthetic import joint_error
+from tests.calib.synthetic import STICK, joint_error
 
-STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
 READOUT_MS = 30.0
 
 

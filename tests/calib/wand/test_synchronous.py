@@ -12,14 +12,13 @@ from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
 from calib.wand.wand_report import WandCalibration
 from camera_node.detection.roundels import Roundels
-from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rotation_from_vector
 from camera_node.protocol.messages import Detections
+from tests.calib.mishaps import repack
 from tests.calib.recordings import WandScenario
 from tests.calib.recordings import record as record_wave
-from tests.calib.synthetic import Arena, camera_errors, ring
+from tests.calib.synthetic import STICK, Arena, camera_errors, ring
 
-STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
 ROWS, SIGMA_PX = 60, 0.5
 PERIODS_NS = [1_000_000, 10_000_000, 100_000_000, 1_000_000_000, 10_000_000_000]
 
@@ -116,8 +115,7 @@ def test_residuals_are_stated_for_all_detections_and_gross_errors_by_their_size(
         if message.camera == "cam1" and message.seq % 5 == 0 and len(seen):
             seen.uv[0] += [0.0, 30.0]
             gross.append(message.t_ns * 1e-9)
-        header = {n: getattr(message, n) for n in ("camera", "seq", "t_ns", "width", "height")}
-        messages.append(Detections.pack(seen, **header))
+        messages.append(repack(message, seen))
     report = calibrate(arena.intrinsics, STICK, messages).report
     given, held_out = report.given, report.held_out
     assert given is not None

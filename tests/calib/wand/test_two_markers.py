@@ -16,9 +16,8 @@ from calib.wand.wand_report import WandCalibration
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
-from tests.calib.synthetic import CAREFUL, joint_error, roughly
+from tests.calib.synthetic import CAREFUL, STICK, joint_error, roughly
 
-STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
 # Visible from both sides, the stick often points at a camera: its image alone then does not distinguish the ends.
 LIGHTS = WandScenario(
     cameras=5,

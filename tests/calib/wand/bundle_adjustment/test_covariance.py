@@ -15,6 +15,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
+from tests.calib.mishaps import repack
 from tests.calib.recordings import WandScenario
 from tests.calib.recordings import record as record_wand
 from tests.calib.synthetic import EXACT, Arena, joint_error, record, ring, roughly
@@ -33,8 +34,7 @@ def with_correlated_errors(messages: list[Detections], seed: int) -> list[Detect
         k = names.index(message.camera)
         off: Array = 0.3 / np.sqrt(2) * np.sin(rate[k] * message.t_ns * 1e-9 + phase[k]).sum(axis=1)
         seen = message.unpack()
-        header = {name: getattr(message, name) for name in ("camera", "seq", "t_ns", "width", "height")}
-        moved.append(Detections.pack(Roundels.from_points(seen.uv + off, 0.1, seen.id), **header))
+        moved.append(repack(message, Roundels.from_points(seen.uv + off, 0.1, seen.id)))
     return moved
 
 

@@ -11,6 +11,7 @@ from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections
+from tests.calib.mishaps import repack
 from tests.calib.synthetic import record, ring
 
 HOUR_NS, TWO_S_NS = 3_600_000_000_000, 2_000_000_000
@@ -25,9 +26,7 @@ def mirrored(message: Detections) -> Detections:
     """Flip the image left to right, as some webcam drivers do."""
     seen = message.unpack()
     seen.uv[:, 0] = message.width - 1 - seen.uv[:, 0]
-    columns = Roundels.from_points(seen.uv, 0.1)
-    header = {name: getattr(message, name) for name in ("camera", "seq", "t_ns", "width", "height")}
-    return Detections.pack(columns, **header)
+    return repack(message, Roundels.from_points(seen.uv, 0.1))
 
 
 def with_fault(messages: list[Detections], fault: Fault) -> list[Detections]:
