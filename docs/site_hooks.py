@@ -7,7 +7,7 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
-ROOT_PAGES = ("CONVENTIONS.md", "DECISIONS.md", "CHANGELOG.md")
+ROOT_PAGES = ("CONVENTIONS.md", "DECISIONS.md", "CHANGELOG.md", "CONTRIBUTING.md")
 TO_ROOT_PAGE = re.compile(
     rf"\]\(\.\./((?:\.\./)?)((?:{'|'.join(ROOT_PAGES)})[^)]*)\)".replace(".md", r"\.md")
 )
