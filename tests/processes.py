@@ -28,6 +28,12 @@ def running(module: str, *words: object, **options: Any) -> Iterator[subprocess.
         assert process.wait(DEADLINE_S) == 0
 
 
+def run_program(*words: object, timeout_s: float = DEADLINE_S) -> subprocess.CompletedProcess[str]:
+    """Run `python -m PROGRAM ...` to its end in a fresh process, as a user does."""
+    command = [sys.executable, "-m", *map(str, words)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
 @contextmanager
 def killed_at_end(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
     """A command, which SIGKILL ends with the block."""

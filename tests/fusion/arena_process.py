@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A server process of a synthetic arena, and what its cameras see in real time."""
+"""A synthetic arena in real time: the settings of its server, and what its cameras send."""
 
 import contextlib
-import subprocess
-import sys
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -12,13 +11,12 @@ from pathlib import Path
 
 import msgspec
 
-from calib.rig.rig import Rig, save_rig
-from camera_node.protocol.messages import encode
+from camera_node.protocol.messages import Detections, encode
 from camera_node.protocol.session import open_client
-from tests.conftest import ROOT
-from tests.fusion.serving import KEYS
+from fusion.server.arena_config import ArenaConfig
+from tests.fusion.serving import KEYS, REAL_TIME_MS, config
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, circle
-from tests.waiting import DEADLINE_S, wait_for
+from tests.waiting import DEADLINE_S
 
 LOOP_S = 8.0  # of the motions, which repeat
 ARENA = Arena(
@@ -26,38 +24,28 @@ ARENA = Arena(
 )
 
 
-class ServerProcess:
-    """`python -m fusion` in a folder, killed and started again on the same port."""
+def saving(folder: Path) -> ArenaConfig:
+    """The settings of a server that saves changes of its rig and robots, and whose cameras send in real time."""
+    saved = {"saved_rig": str(folder / "saved.yaml"), "saved_robots": str(folder / "robots.saved.yaml")}
+    return msgspec.structs.replace(config(folder, lateness_ms=REAL_TIME_MS), **saved)
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        save_rig(Rig(cameras=ARENA.cameras), folder / "rig.yaml")
-        robots = {"robots": {"a": msgspec.to_builtins(TRIANGLE)}}
-        (folder / "robots.yaml").write_bytes(msgspec.yaml.encode(robots))
-        self.start("tcp/127.0.0.1:0")
 
-    def start(self, listen: str) -> None:
-        """Start the server and wait until it listens."""
-        settings = {
-            "arena": "test",
-            "listen": [listen],
-            "rig": "rig.yaml",
-            "robots": "robots.yaml",
-            "saved_rig": "saved.yaml",
-            "saved_robots": "robots.saved.yaml",
-        }
-        (self._folder / "arena.yaml").write_bytes(msgspec.yaml.encode(settings))
-        endpoints = self._folder / "endpoints"
-        endpoints.unlink(missing_ok=True)
-        words = ["--config", str(self._folder / "arena.yaml"), "--endpoints-file", str(endpoints)]
-        self.process = subprocess.Popen([sys.executable, "-m", "fusion", *words], cwd=ROOT)
-        wait_for(lambda: endpoints.exists() or self.process.poll() is not None)
-        (self.endpoint,) = endpoints.read_text().split()
+def in_real_time(
+    messages: list[Detections], period_s: float, stop: threading.Event, max_age_s: float = math.inf
+) -> Iterator[Detections]:
+    """Messages of `period_s` again and again, each stamped with the time at which it is yielded, until `stop` is set.
 
-    def kill(self) -> None:
-        """End the server by SIGKILL."""
-        self.process.kill()
-        self.process.wait()
+    Those that are older than `max_age_s` are left out: a camera on a machine that is too slow drops frames.
+    """
+    begun_ns, n = time.time_ns(), max(message.seq for message in messages) + 1
+    for repetition in count():
+        for message in messages:
+            t_ns = begun_ns + round(repetition * period_s * 1e9) + message.t_ns - messages[0].t_ns
+            if stop.wait(max(0.0, 1e-9 * (t_ns - time.time_ns()))):
+                return
+            if 1e-9 * (time.time_ns() - t_ns) <= max_age_s:
+                seq = message.seq + repetition * n
+                yield msgspec.structs.replace(message, seq=seq, t_ns=t_ns, sent_ns=t_ns)
 
 
 @contextlib.contextmanager
@@ -68,13 +56,8 @@ def cameras_at(endpoint: str) -> Iterator[None]:
 
     def publish() -> None:
         with open_client([endpoint]) as session:
-            for start_ns in count(time.time_ns(), round(LOOP_S * 1e9)):
-                for message in messages:
-                    t_ns = start_ns + message.t_ns - messages[0].t_ns
-                    if stop.wait(max(0.0, 1e-9 * (t_ns - time.time_ns()))):
-                        return
-                    stamped = msgspec.structs.replace(message, t_ns=t_ns, sent_ns=t_ns)
-                    session.put(KEYS.detections(message.camera), encode(stamped))
+            for message in in_real_time(messages, LOOP_S, stop):
+                session.put(KEYS.detections(message.camera), encode(message))
 
     thread = threading.Thread(target=publish)
     thread.start()

@@ -5,10 +5,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 
@@ -21,17 +20,19 @@ from fusion.server.arena_config import ArenaConfig
 from fusion.server.server import Server
 from tests.conftest import ROOT
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, line
-from tests.processes import running
 from tests.waiting import DEADLINE_S, Inbox, wait_for
 
-T = TypeVar("T")
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
+REAL_TIME_MS = Limits().lateness_ms  # of a server whose cameras send frames when they take them
 ATTEMPT_S = 3.0  # from a burst of frames to poses, before the burst is sent again
 
 
-def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
-    """The settings of a server on a port that the operating system chooses; writes rig.yaml and robots.yaml."""
+def config(folder: Path, with_rig: bool = True, lateness_ms: float = 5000) -> ArenaConfig:
+    """The settings of a server on a port that the operating system chooses; writes rig.yaml and robots.yaml.
+
+    Frames are sent in one burst unless a test says otherwise: every frame set waits to be complete.
+    """
     save_rig(Rig(cameras=ARENA.cameras), folder / "rig.yaml")
     (folder / "robots.yaml").write_bytes(
         msgspec.yaml.encode({"robots": {"a": msgspec.to_builtins(TRIANGLE)}})
@@ -42,35 +43,35 @@ def config(folder: Path, with_rig: bool = True) -> ArenaConfig:
         listen=("tcp/127.0.0.1:0",),
         rig=rig,
         robots=str(folder / "robots.yaml"),
-        limits=Limits(lateness_ms=5000),  # frames are sent in one burst: every frame set waits to be complete
+        limits=Limits(lateness_ms=lateness_ms),
     )
 
 
 @contextmanager
 def serving(settings: ArenaConfig) -> Iterator[tuple[Server, Client]]:
     """A server that runs in a thread, and a client that has reached it."""
-    with Server(settings) as server:
-        thread = threading.Thread(target=server.run)
-        thread.start()
-        try:
-            with connected(server) as client:
-                yield server, client
-        finally:
-            server.stop()
-            thread.join(DEADLINE_S)
+    with Server(settings) as server, running_server(server), connected(server) as client:
+        yield server, client
+
+
+@contextmanager
+def running_server(server: Server) -> Iterator[None]:
+    """Serve in a thread until the block ends."""
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.stop()
+        thread.join(DEADLINE_S)
 
 
 @contextmanager
 def connected(server: Server) -> Iterator[Client]:
     """A client that has reached the server."""
     with Client.connect(*server.endpoints, arena="test") as client:
-        until(lambda: list(client.session.get(KEYS.clock, timeout=1.0)))
+        wait_for(lambda: list(client.session.get(KEYS.clock, timeout=1.0)))
         yield client
-
-
-def until(condition: Callable[[], T]) -> T:
-    """The first true value of `condition()`, polled; each poll blocks on the network by itself."""
-    return wait_for(condition)
 
 
 def live(messages: list[Detections], ago_ns: int = 10**9) -> list[Detections]:
@@ -103,23 +104,52 @@ def send_until_tracked(server: Server, client: Client, messages: list[Detections
         send(server, later(messages))
         return poses.until(lambda items: any(pose.state == "tracked" for pose in items), ATTEMPT_S)
 
-    until(is_tracked)
+    wait_for(is_tracked)
+
+
+class ServerProcess:
+    """A server in a process of its own, killed and started again on the same port; a context manager.
+
+    Args:
+        settings: as `config` makes them.
+
+    Attributes:
+        endpoint: on which it listens.
+    """
+
+    def __init__(self, settings: ArenaConfig) -> None:
+        self._settings = settings
+        self.start()
+
+    def __enter__(self) -> "ServerProcess":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.kill()
+
+    def start(self) -> None:
+        """Start the server and wait until it listens."""
+        folder = Path(self._settings.robots).parent
+        file, endpoints = folder / "arena.yaml", folder / "endpoints"
+        endpoints.unlink(missing_ok=True)
+        file.write_text(dump_yaml(self._settings))
+        words = ["--config", str(file), "--endpoints-file", str(endpoints)]
+        self.process = subprocess.Popen([sys.executable, "-m", "fusion", *words], cwd=ROOT)
+        wait_for(lambda: endpoints.exists() or self.process.poll() is not None)
+        assert self.process.poll() is None, "the server ended"
+        (self.endpoint,) = endpoints.read_text().split()
+        self._settings = msgspec.structs.replace(self._settings, listen=(self.endpoint,))
+
+    def kill(self) -> None:
+        """End the server by SIGKILL."""
+        self.process.kill()
+        self.process.wait()
 
 
 @contextmanager
 def serving_process(settings: ArenaConfig) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """A server in a process of its own, and the endpoint on which it listens."""
-    folder = Path(settings.robots).parent
-    file, endpoints = folder / "arena.yaml", folder / "endpoints"
-    endpoints.unlink(missing_ok=True)
-    file.write_text(dump_yaml(settings))
-    with running("fusion", "--config", file, "--endpoints-file", endpoints) as process:
-        wait_for(lambda: endpoints.exists() or process.poll() is not None)
-        assert process.poll() is None, "the server ended"
-        yield endpoints.read_text().splitlines()[0], process
-
-
-def run_program(*words: str) -> subprocess.CompletedProcess[str]:
-    """Run `python -m PROGRAM ...` in a fresh process, as a user does."""
-    command = [sys.executable, "-m", *words]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    """A server in a process of its own, and the endpoint on which it listens; SIGTERM must end it with exit code 0."""
+    with ServerProcess(settings) as server:
+        yield server.endpoint, server.process
+        server.process.terminate()
+        assert server.process.wait(DEADLINE_S) == 0

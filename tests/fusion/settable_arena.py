@@ -12,10 +12,10 @@ from fusion.client.arena import Arena as Client
 from fusion.protocol.pose_messages import RobotPose
 from tests.conftest import ROOT
 from tests.fusion.moving_cameras import MOVING
-from tests.fusion.serving import DEADLINE_S, config
+from tests.fusion.serving import config
 from tests.fusion.settable_clock import SettableClock
 from tests.processes import killed_at_end, running
-from tests.waiting import wait_for
+from tests.waiting import DEADLINE_S, wait_for
 
 
 def error_m(pose: RobotPose, server_ahead_ns: int) -> float:

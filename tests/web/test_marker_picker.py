@@ -13,10 +13,9 @@ from playwright.sync_api import Page, TimeoutError
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.server_connection import ServerConnection
 from fusion.client.arena import Arena as Client
-from tests.fusion.serving import DEADLINE_S
 from tests.fusion.synthetic import WIDE
 from tests.fusion.unknown_robot import WIDE_MOTION, serving_an_unknown_robot
-from tests.waiting import wait_for
+from tests.waiting import DEADLINE_S, wait_for
 from tests.web.browser import browsing, showing
 from web.state.feed import Feed
 from web.state.subscription import Subscription

@@ -4,9 +4,6 @@
 import contextlib
 import re
 import socket
-import subprocess
-import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -22,15 +19,14 @@ from camera_node.protocol.tcp_sockets import tcp_sockets
 from fusion.bridges.foxglove_server import serving
 from fusion.client.arena import Arena
 from fusion.protocol.pose_messages import RobotPose
-from tests.conftest import ROOT
-from tests.fusion.arena_process import ARENA, ServerProcess, cameras_at
+from tests.fusion.arena_process import ARENA, cameras_at, saving
 from tests.fusion.bridges.foxglove_reader import FoxgloveClient
 from tests.fusion.bridges.pose_server import bridge
-from tests.fusion.serving import KEYS
+from tests.fusion.serving import KEYS, ServerProcess
 from tests.fusion.synthetic import TRIANGLE
 from tests.missing_package import advice_without
 from tests.processes import first_line
-from tests.waiting import DEADLINE_S, Inbox
+from tests.waiting import DEADLINE_S, Inbox, repeating
 
 
 def place(vector: Any) -> list[float]:
@@ -46,34 +42,31 @@ def nanoseconds(stamp: Any) -> int:
 
 
 def test_foxglove_shows_the_arena_and_continues_after_a_restart(tmp_path: Path):
-    server = ServerProcess(tmp_path)
-    try:
-        with (
-            cameras_at(server.endpoint),
-            Arena.connect(server.endpoint, arena="test") as arena,
-            bridge("foxglove", "--connect", server.endpoint, "--port", "0") as process,
-        ):
-            inbox = Inbox()
-            arena.robot("a").on_pose(inbox.put)
-            match = re.search(r":(\d+)$", first_line(process))
-            assert match
-            with FoxgloveClient(int(match[1])) as client:
-                check_poses(client, inbox)
-                check_cameras(client)
-                check_scene(client)
-                _, _, update = client.next("/markers")
-                (unlabeled,) = update.entities
-                assert unlabeled.frame_id == "world"
-                assert len(unlabeled.spheres) <= 4  # those of the robot that the server does not know
-            check_images(int(match[1]), server.endpoint)
-            since_ns = inbox.items[-1].t_ns
-            server.kill()
-            server.start(server.endpoint)
-            with FoxgloveClient(int(match[1])) as client:
-                while client.next("/tf")[1] <= since_ns:
-                    pass
-    finally:
+    with (
+        ServerProcess(saving(tmp_path)) as server,
+        cameras_at(server.endpoint),
+        Arena.connect(server.endpoint, arena="test") as arena,
+        bridge("foxglove", "--connect", server.endpoint, "--port", "0") as process,
+    ):
+        inbox = Inbox()
+        arena.robot("a").on_pose(inbox.put)
+        match = re.search(r":(\d+)$", first_line(process))
+        assert match
+        with FoxgloveClient(int(match[1])) as client:
+            check_poses(client, inbox)
+            check_cameras(client)
+            check_scene(client)
+            _, _, update = client.next("/markers")
+            (unlabeled,) = update.entities
+            assert unlabeled.frame_id == "world"
+            assert len(unlabeled.spheres) <= 4  # those of the robot that the server does not know
+        check_images(int(match[1]), server.endpoint)
+        since_ns = inbox.items[-1].t_ns
         server.kill()
+        server.start()
+        with FoxgloveClient(int(match[1])) as client:
+            while client.next("/tf")[1] <= since_ns:
+                pass
 
 
 def check_poses(client: FoxgloveClient, inbox: Inbox) -> None:
@@ -132,36 +125,12 @@ def check_images(port: int, endpoint: str) -> None:
     camera = sorted(ARENA.cameras)[0]
     picture = cv2.imencode(".jpg", np.full((48, 64), 90, np.uint8))[1].tobytes()
     preview = encode(Preview(camera=camera, t_ns=123, width=640, height=480, jpeg=picture))
-    done = threading.Event()
     with open_client([endpoint]) as session:
         publisher = session.declare_publisher(KEYS.preview(camera))
         assert not publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
-
-        def repeat() -> None:
-            while not done.wait(0.05):
-                publisher.put(preview)
-
-        thread = threading.Thread(target=repeat)
-        thread.start()
-        try:
-            with FoxgloveClient(port, images=True) as client:
-                topic, t_ns, image = client.next(f"/cameras/{camera}/image")
-        finally:
-            done.set()
-            thread.join(DEADLINE_S)
+        with repeating(lambda: publisher.put(preview), 0.05), FoxgloveClient(port, images=True) as client:
+            topic, t_ns, image = client.next(f"/cameras/{camera}/image")
     assert (topic, t_ns, image.format, image.data) == (f"/cameras/{camera}/image", 123, "jpeg", picture)
-
-
-def test_a_port_in_use_is_reported_in_one_line(endpoint: str):
-    with bridge("foxglove", "--connect", endpoint, "--port", "0") as process:
-        port = first_line(process).strip().rpartition(":")[2]
-        words = [sys.executable, "-m", "fusion", "foxglove", "--port", port]
-        program = subprocess.run(
-            words, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False
-        )
-    assert program.returncode == 75
-    assert len(program.stderr.splitlines()) == 1
-    assert f"can't listen on 127.0.0.1 port {port}" in program.stderr
 
 
 def test_without_the_sdk_one_line_says_what_to_install():

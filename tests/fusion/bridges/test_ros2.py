@@ -5,7 +5,6 @@ import contextlib
 import queue
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -27,7 +26,8 @@ from fusion.commands.bridges.ros2 import ros2
 from fusion.protocol.pose_messages import RobotPose
 from tests.conftest import free_port
 from tests.fusion.bridges.pose_server import PoseServer, publish_poses, restart
-from tests.waiting import DEADLINE_S
+from tests.processes import killed_at_end, run_program
+from tests.waiting import DEADLINE_S, repeating
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
 
@@ -148,27 +148,21 @@ def routing() -> Iterator[tuple[zenoh.Session, str]]:
         yield router, listening_endpoints(router, listen)[0]
 
 
-@contextlib.contextmanager
-def bridging(endpoint: str, *options: str) -> Iterator[subprocess.Popen]:
+def bridging(endpoint: str, *options: str) -> contextlib.AbstractContextManager[subprocess.Popen]:
     command = [sys.executable, "-m", "fusion", "ros2", "--connect", endpoint, "--arena", "test", *options]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+    return killed_at_end(command, stderr=subprocess.PIPE, text=True)
 
 
-def repeat(session: zenoh.Session, poses: list[RobotPose], done: threading.Event) -> None:
+def publishing(session: zenoh.Session, poses: list[RobotPose]) -> contextlib.AbstractContextManager[None]:
     """Publish the poses repeatedly, as a server does."""
-    while not done.wait(0.05):
-        publish_poses(session, poses)
+    return repeating(lambda: publish_poses(session, poses), 0.05)
 
 
 @pytest.mark.parametrize("humble", [False, True])
 @pytest.mark.parametrize("own_router", [False, True])
 def test_a_node_of_rmw_zenoh_receives_the_robots_and_lists_the_topics(humble, own_router):
     options = ["--humble"] * humble
-    received, tokens, done = queue.Queue(), queue.Queue(), threading.Event()
+    received, tokens = queue.Queue(), queue.Queue()
     poses = [POSE, draw_pose("gone", "lost")]
     with contextlib.ExitStack() as stack:
         server, endpoint = stack.enter_context(routing())
@@ -179,17 +173,12 @@ def test_a_node_of_rmw_zenoh_receives_the_robots_and_lists_the_topics(humble, ow
         ros = stack.enter_context(ros_peer(ros_endpoint))
         topics = ros.declare_subscriber("3/lab/**", received.put)
         graph = ros.liveliness().declare_subscriber("@ros2_lv/3/**", tokens.put, history=True)
-        arena = threading.Thread(target=repeat, args=(server, poses, done))
-        arena.start()
-        try:
-            with bridging(endpoint, "--domain", "3", "--namespace", "/lab", *options):
-                samples = [received.get(timeout=DEADLINE_S) for _ in range(6)]
-                entities = {str(tokens.get(timeout=DEADLINE_S).key_expr) for _ in range(4)}
-        finally:
-            topics.undeclare()
-            graph.undeclare()
-            done.set()
-            arena.join(DEADLINE_S)
+        stack.enter_context(publishing(server, poses))
+        with bridging(endpoint, "--domain", "3", "--namespace", "/lab", *options):
+            samples = [received.get(timeout=DEADLINE_S) for _ in range(6)]
+            entities = {str(tokens.get(timeout=DEADLINE_S).key_expr) for _ in range(4)}
+        topics.undeclare()
+        graph.undeclare()
     kinds = {"pose": "geometry_msgs/msg/PoseStamped", "odometry": "nav_msgs/msg/Odometry"}
     for sample in samples:
         domain, namespace, robot, topic, typed, type_hash = str(sample.key_expr).split("/")
@@ -267,9 +256,7 @@ def test_the_last_message_of_each_burst_is_express():
 @pytest.mark.parametrize("domain", ["-1", "233", "lab"])
 def test_an_invalid_domain_is_refused(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
-    program = subprocess.run(
-        [sys.executable, "-m", "fusion", "ros2"], capture_output=True, text=True, timeout=DEADLINE_S
-    )
+    program = run_program("fusion", "ros2")
     assert program.returncode == 2
     assert f"the ROS domain is '{domain}'; give --domain" in program.stderr
 
@@ -281,31 +268,20 @@ def test_an_invalid_namespace_is_refused(namespace):
 
 
 def test_silence_is_logged_once_and_its_end_too():
-    done = threading.Event()
     with routing() as (server, endpoint), bridging(endpoint) as process:
         assert process.stderr is not None
         assert "no pose from arena 'test'" in process.stderr.readline()
-        arena = threading.Thread(target=repeat, args=(server, [POSE], done))
-        arena.start()
-        try:
+        with publishing(server, [POSE]):
             assert "receiving poses again" in process.stderr.readline()
-        finally:
-            done.set()
-            arena.join(DEADLINE_S)
 
 
 def test_one_stream_has_the_poses_of_all_robots():
-    done = threading.Event()
-    poses = [POSE, msgspec.structs.replace(POSE, robot="drone")]
-    with routing() as (server, endpoint), Arena.connect(endpoint, arena="test") as arena:
-        thread = threading.Thread(target=repeat, args=(server, poses, done))
-        thread.start()
-        try:
-            seen = queue.Queue()
-            arena.poses(DEADLINE_S).on_message(seen.put)
-            robots = {seen.get(timeout=DEADLINE_S).robot for _ in range(4)}
-            assert robots == {"rover", "drone"}
-            assert arena.robot("drone", DEADLINE_S).next().robot == "drone"
-        finally:
-            done.set()
-            thread.join(DEADLINE_S)
+    poses, seen = [POSE, msgspec.structs.replace(POSE, robot="drone")], queue.Queue()
+    with (
+        routing() as (server, endpoint),
+        Arena.connect(endpoint, arena="test") as arena,
+        publishing(server, poses),
+    ):
+        arena.poses(DEADLINE_S).on_message(seen.put)
+        assert {seen.get(timeout=DEADLINE_S).robot for _ in range(4)} == {"rover", "drone"}
+        assert arena.robot("drone", DEADLINE_S).next().robot == "drone"

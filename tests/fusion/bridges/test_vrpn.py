@@ -19,7 +19,7 @@ from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from fusion.bridges.vrpn_messages import VELOCITY_S, turn
 from tests.conftest import ROOT, free_port
 from tests.fusion.bridges.pose_server import PoseServer, bridge, restart
-from tests.processes import first_line
+from tests.processes import first_line, killed_at_end, run_program
 from tests.waiting import DEADLINE_S
 
 FLOAT32 = 1e-6  # relative; libmotioncapture converts to float32, whose steps are 1.2e-7
@@ -39,13 +39,10 @@ def serving(server: PoseServer) -> Iterator[int]:
 def motion_capture(host: str) -> Iterator[Iterator[dict[str, list[float]]]]:
     """The frames that libmotioncapture receives."""
     words = [sys.executable, "-m", "tests.fusion.bridges.motioncapture_client", host]
-    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    with killed_at_end(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        try:
-            # VRPN's notes are on stdout, too
-            yield (json.loads(line) for line in process.stdout if line.startswith("{"))
-        finally:
-            process.kill()
+        # VRPN's notes are on stdout, too
+        yield (json.loads(line) for line in process.stdout if line.startswith("{"))
 
 
 class VrpnReader:
@@ -212,13 +209,11 @@ def test_hostile_clients_do_not_end_the_bridge(endpoint: str):
             assert reader.next()[0] in ("rover", "drone")
 
 
-def test_a_port_in_use_is_reported_in_one_line():
+@pytest.mark.parametrize("command", ["vrpn", "foxglove"])
+def test_a_port_in_use_is_reported_in_one_line(command: str):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        words = [sys.executable, "-m", "fusion", "vrpn", "--port", port]
-        program = subprocess.run(
-            words, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False
-        )
+        program = run_program("fusion", command, "--port", port)
     assert program.returncode == 75
     assert len(program.stderr.splitlines()) == 1
     assert f"can't listen on 127.0.0.1 port {port}" in program.stderr

@@ -13,12 +13,13 @@ from fusion.commands.define import define
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots
 from tests.conftest import ROOT, free_port
-from tests.fusion.serving import DEADLINE_S, until
 from tests.fusion.unknown_robot import serving_an_unknown_robot
+from tests.processes import run_program
+from tests.waiting import DEADLINE_S, wait_for
 
 
-def command(endpoint: str, *words: str) -> list[str]:
-    return [sys.executable, "-m", "fusion", "define", *words, "--connect", endpoint, "--arena", "test"]
+def run_define(endpoint: str, *words: str) -> subprocess.CompletedProcess[str]:
+    return run_program("fusion", "define", *words, "--connect", endpoint, "--arena", "test")
 
 
 def test_a_robot_is_replaced_on_request_only(tmp_path):
@@ -38,11 +39,10 @@ def test_a_robot_is_replaced_on_request_only(tmp_path):
 def test_a_robot_in_a_running_arena_is_defined(tmp_path):
     """By the command, while the server tracks another one; the output is an entry for robots.yaml."""
     with serving_an_unknown_robot(tmp_path) as (endpoint, client):
-        words = command(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
-        done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+        done = run_define(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
         assert done.returncode == 0, done.stderr
         assert "the server now tracks b, with 3 markers" in done.stdout
-        until(lambda: client.robot("b", DEADLINE_S).next().state == "tracked")
+        wait_for(lambda: client.robot("b", DEADLINE_S).next().state == "tracked")
         robots = client.change_robots()
         assert set(robots) == {"a", "b"}
         path = tmp_path / "measured.yaml"
@@ -53,8 +53,7 @@ def test_a_robot_in_a_running_arena_is_defined(tmp_path):
 
 
 def test_a_misspelt_command_gets_a_suggestion():
-    words = [sys.executable, "-m", "fusion", "defined", "b"]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    done = run_program("fusion", "defined", "b")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "did you mean define?" in done.stderr
 
@@ -67,8 +66,7 @@ def test_a_misspelt_command_gets_a_suggestion():
     ],
 )
 def test_an_invalid_definition_is_reported_in_one_line(words, said):
-    words = command(f"tcp/127.0.0.1:{free_port()}", *words)
-    done = subprocess.run(words, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    done = run_define(f"tcp/127.0.0.1:{free_port()}", *words)
     assert done.returncode == 2
     assert said in done.stderr
     assert done.stderr.count("\n") == 1

@@ -4,8 +4,6 @@
 import json
 import shutil
 import socket
-import subprocess
-import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -16,43 +14,32 @@ from fusion.diagnosis.findings import check_certificates, check_disk, check_list
 from fusion.protocol.arena_health import assess_calibration
 from fusion.server.arena_config import ArenaConfig
 from tests.conftest import ROOT, free_port
-from tests.fusion.arena_process import ARENA, ServerProcess, cameras_at
+from tests.fusion.arena_process import ARENA, cameras_at, saving
+from tests.fusion.serving import ServerProcess
+from tests.processes import run_program
 from tests.security.lab import certificates
 from tests.waiting import wait_for
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 
 
-def fusion(*words: str) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end, from a fresh process."""
-    return subprocess.run(
-        [sys.executable, "-m", "fusion", *words],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-
-
 def test_health_and_doctor_of_a_running_arena(tmp_path: Path):
     """Healthy while cameras send; with the names of all cameras once they stop."""
-    server = ServerProcess(tmp_path)
-    try:
+    with ServerProcess(saving(tmp_path)) as server:
         words = ("--connect", server.endpoint, "--arena", "test")
         with cameras_at(server.endpoint):
-            wait_for(lambda: fusion("health", *words).returncode == 0)
-            done = fusion("health", *words, "--json")
+            wait_for(lambda: run_program("fusion", "health", *words).returncode == 0)
+            done = run_program("fusion", "health", *words, "--json")
             state = json.loads(done.stdout)
             assert state["healthy"]
             assert state["robots"] == {"a": "tracked"}
             assert all(state["cameras"][name] for name in ARENA.cameras)
-            checked = fusion("doctor", "--config", str(tmp_path / "arena.yaml"), "--connect", server.endpoint)
-        wait_for(lambda: fusion("health", *words).returncode == 1)
-        silent = json.loads(fusion("health", *words, "--json").stdout)
+            checked = run_program(
+                "fusion", "doctor", "--config", str(tmp_path / "arena.yaml"), "--connect", server.endpoint
+            )
+        wait_for(lambda: run_program("fusion", "health", *words).returncode == 1)
+        silent = json.loads(run_program("fusion", "health", *words, "--json").stdout)
         assert {f"camera {name}: sends no frames" for name in ARENA.cameras} <= set(silent["problems"])
-    finally:
-        server.kill()
     assert "error" not in checked.stdout
     assert "ok      robot a: tracked" in checked.stdout
     assert "no date recorded" in checked.stdout
@@ -61,10 +48,10 @@ def test_health_and_doctor_of_a_running_arena(tmp_path: Path):
 @pytest.mark.computed
 def test_without_a_server_health_is_2_and_doctor_says_what_to_do(tmp_path: Path):
     nowhere = f"tcp/127.0.0.1:{free_port()}"
-    done = fusion("health", "--connect", nowhere, "--timeout-s", "0.5")
+    done = run_program("fusion", "health", "--connect", nowhere, "--timeout-s", "0.5")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
-    checked = fusion("doctor", "--connect", nowhere, "--timeout-s", "0.5")
+    checked = run_program("fusion", "doctor", "--connect", nowhere, "--timeout-s", "0.5")
     assert checked.returncode == 1
     assert "start it with roundel server" in checked.stdout
 

@@ -2,8 +2,6 @@
 """Recordings in the formats of other programs, read back by independent readers: c3d, ezc3d, rosbags."""
 
 import csv
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -22,10 +20,9 @@ from camera_node.protocol.messages import encode
 from fusion.commands.export import export
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import RobotPose, Robots
-from tests.conftest import ROOT
 from tests.fusion.bridges.foxglove_reader import read_mcap
 from tests.fusion.bridges.pose_server import moving_pose
-from tests.waiting import DEADLINE_S
+from tests.missing_package import advice_without
 
 START_NS, RATE_HZ, N = 1_790_000_000_000_000_000, 60, 180
 BODY = Robot(diameter_m=0.09, markers=((0.1, 0.0, 0.0), (-0.1, 0.05, 0.0), (0.0, -0.1, 0.02)))
@@ -234,9 +231,5 @@ def test_a_recording_too_long_for_c3d_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize(("package", "out"), [("ezc3d", "out.c3d"), ("rosbags", "bag")])
 def test_without_its_library_one_line_says_what_to_install(recording: Path, package: str, out: str):
-    code = f"import sys; sys.modules['{package}'] = None; from fusion.__main__ import main; main()"
-    words = [sys.executable, "-c", code, "export", str(recording), str(recording.with_name(out))]
-    program = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert program.returncode == 2
-    assert len(program.stderr.splitlines()) == 1
-    assert "pip install 'roundel[export]'" in program.stderr
+    advice = advice_without(package, "fusion", "export", str(recording), str(recording.with_name(out)))
+    assert "pip install 'roundel[export]'" in advice

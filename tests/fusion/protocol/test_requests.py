@@ -3,8 +3,6 @@
 
 import json
 import os
-import subprocess
-import sys
 
 import msgspec
 import pytest
@@ -19,19 +17,10 @@ from fusion.model.robots import load_robots
 from fusion.protocol.pose_messages import Robots, RobotsRequest, robots_key, set_robots_key
 from fusion.protocol.robot_requests import change_robots
 from fusion.tracking.tracker import PAUSED
-from tests.fusion.serving import (
-    ARENA,
-    DEADLINE_S,
-    KEYS,
-    config,
-    later,
-    live,
-    send,
-    send_until_tracked,
-    serving,
-    until,
-)
+from tests.fusion.serving import ARENA, KEYS, config, later, live, send, send_until_tracked, serving
 from tests.fusion.synthetic import WIDE
+from tests.processes import run_program
+from tests.waiting import DEADLINE_S, wait_for
 
 
 def request_reply(client, key: str, payload: bytes = b"") -> tuple[bytes | None, str]:
@@ -105,13 +94,12 @@ def test_a_robot_is_not_overwritten_unless_asked(tmp_path):
         assert client.change_robots(define={"b": other}, replace=True)["b"] == other
         client.change_robots(rename={"a": "c"})
         assert client.declared_robots().unsaved == ("a", "b", "c")
-        until(lambda: client.status(DEADLINE_S).next().unsaved_robots == ("a", "b", "c"))
+        wait_for(lambda: client.status(DEADLINE_S).next().unsaved_robots == ("a", "b", "c"))
 
 
 def test_the_robots_command_lists_renames_removes_and_saves(tmp_path):
     def robots(*words: str) -> tuple[int, str]:
-        command = [sys.executable, "-m", "fusion", "robots", *words, *where]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+        done = run_program("fusion", "robots", *words, *where)
         return done.returncode, done.stdout + done.stderr
 
     with serving(config(tmp_path)) as (server, client):
@@ -135,16 +123,16 @@ def test_no_robot_is_acquired_while_a_wand_is_recorded(tmp_path):
     """Another program declares the token, as calib does while it records; it is counted until that ends."""
     with serving(config(tmp_path)) as (server, client):
         wand = client.session.liveliness().declare_token(KEYS.wand)
-        until(lambda: client.status(DEADLINE_S).next().not_acquired == {"a": PAUSED})
+        wait_for(lambda: client.status(DEADLINE_S).next().not_acquired == {"a": PAUSED})
         first = live(ARENA.messages(30))
         send(server, first)
-        until(lambda: client.status(DEADLINE_S).next().frame_sets_per_s > 0)
+        wait_for(lambda: client.status(DEADLINE_S).next().frame_sets_per_s > 0)
         assert server.pipeline.tracker is not None
         assert server.pipeline.tracker.table.status == [None]
         wand.undeclare()
-        until(lambda: client.status(DEADLINE_S).next().not_acquired.get("a") != PAUSED)
+        wait_for(lambda: client.status(DEADLINE_S).next().not_acquired.get("a") != PAUSED)
         send(server, later(first))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        wait_for(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
 
 
 def test_the_key_for_reading_robots_changes_none(tmp_path):

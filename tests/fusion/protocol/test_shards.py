@@ -3,7 +3,6 @@
 
 import contextlib
 import itertools
-import threading
 from dataclasses import replace
 
 import msgspec
@@ -21,9 +20,10 @@ from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import Server
 from fusion.tracking.result import TrackingResult
 from fusion.tracking.tracker import Tracker
-from tests.fusion.serving import DEADLINE_S, config, live, send, serving, until
+from tests.fusion.serving import config, live, running_server, send, serving
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
 from tests.fusion.tracks import errors
+from tests.waiting import DEADLINE_S, wait_for
 
 NAMES = [f"robot_{k}" for k in range(200)]
 
@@ -122,13 +122,9 @@ def test_two_shards_on_loopback_each_track_their_own_robots(tmp_path):
     arena = Arena(robots, {name: line(at) for name, at in places.items()}, sigma_px=0.05)
     first = msgspec.structs.replace(config(tmp_path), shard="1/2", limits=Limits(lateness_ms=200))
     (tmp_path / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": msgspec.to_builtins(robots)}))
-    with contextlib.ExitStack() as stack:
-        server, client = stack.enter_context(serving(first))
+    with serving(first) as (server, client):
         other_shard = msgspec.structs.replace(first, shard="2/2", listen=server.endpoints)
-        second = stack.enter_context(Server(other_shard))
-        thread = threading.Thread(target=second.run)
-        thread.start()
-        try:
+        with Server(other_shard) as second, running_server(second):
             streams = {name: client.robot(name, DEADLINE_S) for name in robots}
             markers = client.markers(DEADLINE_S)
 
@@ -142,17 +138,11 @@ def test_two_shards_on_loopback_each_track_their_own_robots(tmp_path):
                 send(server, live(noisy.messages(1), ago_ns=0))
                 with contextlib.suppress(NetworkError):
                     markers.next(0.04)
-                return all(near(s.latest(), places[name]) for name, s in streams.items()) and labels >= {
-                    0,
-                    1,
-                    2,
-                }
+                are_near = all(near(s.latest(), places[name]) for name, s in streams.items())
+                return are_near and labels >= {0, 1, 2}
 
-            until(are_all_right)
+            wait_for(are_all_right)
             assert server.pipeline.tracker is not None
             assert second.pipeline.tracker is not None
             assert server.pipeline.tracker.table.owned.tolist() == [True, False, False]
             assert second.pipeline.tracker.table.owned.tolist() == [False, True, True]
-        finally:
-            second.stop()
-            thread.join(DEADLINE_S)

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A replay repeats the poses and the markers of the live server byte for byte, on a network with every fault."""
 
-import signal
 import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -16,10 +14,10 @@ from camera_node.protocol.messages import Detections, decode, encode
 from camera_node.protocol.session import open_client
 from fusion.commands.replay import replay
 from fusion.protocol.pose_messages import FusedFrames, RobotPose
-from tests.conftest import ROOT
-from tests.fusion.arena_process import ARENA, ServerProcess
-from tests.fusion.serving import KEYS
-from tests.waiting import DEADLINE_S, wait_for
+from tests.fusion.arena_process import ARENA, saving
+from tests.fusion.serving import KEYS, ServerProcess
+from tests.processes import running
+from tests.waiting import wait_for
 
 FRAMES = 120  # of each camera: 4 s
 LOST, LATE, VERY_LATE = 0.05, 0.1, 0.02  # shares of frames; the last ones miss the server's limit of 150 ms
@@ -76,17 +74,12 @@ def content(path: Path, since_ns: int, until_ns: int) -> tuple[dict, dict]:
 
 def test_a_replay_equals_the_live_server(tmp_path: Path):
     """From the first complete frame set on, although frames were lost, late and too late, and a camera was away."""
-    server, path = ServerProcess(tmp_path), tmp_path / "live.mcap"
-    words = ["record", str(path), "--connect", server.endpoint, "--arena", "test"]
-    recorder = subprocess.Popen([sys.executable, "-m", "fusion", *words], cwd=ROOT, stdout=subprocess.DEVNULL)
-    try:
-        wait_for(path.exists)
-        publish(server.endpoint)
-        recorder.send_signal(signal.SIGTERM)
-        assert recorder.wait(DEADLINE_S) == 0
-    finally:
-        recorder.kill()
-        server.kill()
+    path = tmp_path / "live.mcap"
+    with ServerProcess(saving(tmp_path)) as server:
+        words = ("record", path, "--connect", server.endpoint, "--arena", "test")
+        with running("fusion", *words, stdout=subprocess.DEVNULL):
+            wait_for(path.exists)
+            publish(server.endpoint)
     assert replay(path, out=tmp_path / "again.mcap") == 0
     sets = [
         decode(data, FusedFrames).t_ns

@@ -20,10 +20,13 @@ from mcap.reader import make_reader
 from calib.rig.recording import MAX_LOST, MIN_CHUNK, RecordingWriter, read_messages
 from calib.rig.recording_repair import repair_recording
 from camera_node.foundation.errors import ConfigError
+from camera_node.protocol.server_connection import Connection
+from fusion.commands.record import record
 from fusion.commands.repair import repair
 from fusion.recordings.arena_recording import read_recording
 from tests.conftest import ROOT
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
+from tests.processes import killed_at_end, run_program
 from tests.waiting import DEADLINE_S, wait_for
 
 pytestmark = pytest.mark.computed
@@ -66,14 +69,9 @@ def recorder(
     with serving(config(folder)) as (server, _):
         arguments = ["--connect", server.endpoints[0], "--arena", "test"]
         command = [sys.executable, "-c", program, *words, *arguments]
-        process = subprocess.Popen(
-            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        try:
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        with killed_at_end(command, cwd=ROOT, text=True, **pipes) as process:
             yield process, lambda: send(server, live(ARENA.messages(3)))
-        finally:
-            process.kill()
-            process.communicate()
 
 
 def test_what_a_cut_off_loses_and_what_the_recorder_remembers_are_a_small_share(tmp_path: Path):
@@ -109,17 +107,24 @@ def test_the_recorder_remembers_a_chunk_in_a_kilobyte_however_many_keys_it_holds
     assert grown < 1000 * chunks
 
 
+def test_an_empty_recording_is_reported(tmp_path: Path, endpoint: str, capsys: pytest.CaptureFixture[str]):
+    """No server is there: the exit code is 1, and the last line says why the file is empty."""
+    assert record(tmp_path / "x.mcap", connection=Connection(connect=(endpoint,)), seconds=0.2) == 1
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == f"warning: the recording is empty: no message of arena 'arena' arrived from {endpoint}"
+
+
 def test_an_existing_recording_is_not_overwritten(tmp_path):
     write(tmp_path / "a.mcap", entries(3))
     before = (tmp_path / "a.mcap").read_bytes()
-    words = [sys.executable, "-m", "fusion", "record", str(tmp_path / "a.mcap"), "--seconds", "0.1"]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    words = ["fusion", "record", tmp_path / "a.mcap", "--seconds", "0.1"]
+    done = run_program(*words)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "--force" in done.stderr
     assert (tmp_path / "a.mcap").read_bytes() == before
-    forced = subprocess.run([*words, "--force"], cwd=ROOT, capture_output=True, timeout=60, check=False)
-    assert forced.returncode == 1  # without a server it is empty, which the command reports
+    # without a server it is empty, which the command reports
+    assert run_program(*words, "--force").returncode == 1
     assert indexed(tmp_path / "a.mcap") == []
 
 

@@ -22,9 +22,10 @@ from fusion.protocol.pose_messages import Robots
 from fusion.recordings.arena_recording import ArenaRecorder, read_recording
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
-from tests.fusion.serving import ARENA, KEYS, config, live, run_program, send, serving
+from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 from tests.fusion.tracks import errors, poses_of
+from tests.processes import run_program
 from tests.waiting import DEADLINE_S, repeating, wait_for
 
 BUSY_S = 3.5  # more than 3 s, after which the recorder gave up before, with answers of up to 1 s

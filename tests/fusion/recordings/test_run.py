@@ -3,8 +3,6 @@
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import msgspec
@@ -17,6 +15,7 @@ from fusion.commands.run import run
 from fusion.export.pose_formats import COLUMNS
 from fusion.model.robots import Robot
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
+from tests.processes import run_program
 from tests.truth import true_camera
 
 ARENA = Arena(
@@ -70,13 +69,7 @@ def test_invalid_input_is_reported_in_one_line(recording, fault, said):
     else:
         del recording["observations"]
     options = [part for name, path in recording.items() for part in (f"--{name}", str(path))]
-    done = subprocess.run(
-        [sys.executable, "-m", "fusion", "run", *options],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = run_program("fusion", "run", *options)
     assert done.returncode == 2
     error = done.stderr
     assert said in error

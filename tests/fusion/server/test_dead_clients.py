@@ -12,9 +12,9 @@ from pathlib import Path
 import zenoh
 
 from camera_node.protocol.session import LEASE_MS, open_client
-from tests.fusion.serving import DEADLINE_S, KEYS, config, serving_process
+from tests.fusion.serving import KEYS, config, serving_process
 from tests.processes import first_line, killed_at_end
-from tests.waiting import slowness
+from tests.waiting import DEADLINE_S, slowness
 
 LISTENER = """
 import sys, time

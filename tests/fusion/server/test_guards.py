@@ -7,34 +7,23 @@ from pathlib import Path
 
 import pytest
 
-from camera_node.protocol.messages import Detections
 from camera_node.protocol.requests import respond
 from fusion.protocol.pose_messages import RobotPose
-from fusion.server.server import Server
 from fusion.server.transport import INTERNAL_ERROR
-from tests.fusion.serving import ARENA, DEADLINE_S, config, later, live, send, serving, until
-from tests.waiting import Inbox
+from tests.fusion.serving import ARENA, config, later, live, send, send_until_tracked, serving
+from tests.waiting import DEADLINE_S, Inbox, wait_for
 
 
 def raise_error(*_: object) -> None:
     raise ValueError("a bug that some input shows")
 
 
-def is_tracked_again(server: Server, frames: list[Detections], poses: Inbox, n: int) -> bool:
-    """Whether new frames give a tracked pose; waits, so that the next call's frames are later than these."""
-    send(server, later(frames))
-    return poses.until(lambda items: any(pose.state == "tracked" for pose in items[n:]), 3.0)
-
-
 @pytest.mark.parametrize("stage", ["a task", "tracking", "association", "the status"])
 def test_the_server_continues_after_any_exception(tmp_path: Path, caplog, stage: str):
     """Before: the server's loop ended with the first exception that was not of NumPy or GTSAM."""
     with serving(config(tmp_path)) as (server, client):
-        poses = Inbox()
-        client.robot("a").on_pose(poses.put)
         frames = live(ARENA.messages(12))
-        send(server, frames)
-        assert poses.until(lambda items: any(pose.state == "tracked" for pose in items))
+        send_until_tracked(server, client, frames)
         tracker = server.pipeline.tracker
         faulty: dict[str, Callable[[], object]] = {
             "a task": raise_error,
@@ -45,20 +34,19 @@ def test_the_server_continues_after_any_exception(tmp_path: Path, caplog, stage:
         server.transport.enqueue(faulty[stage])
         send(server, later(frames))
         if stage == "the status":
-            until(lambda: "the status failed" in caplog.text)
+            wait_for(lambda: "the status failed" in caplog.text)
             server.transport.enqueue(lambda: delattr(server.statistics, "_reset"))
-        faults = until(lambda: client.status(DEADLINE_S).next().faults)
+        faults = wait_for(lambda: client.status(DEADLINE_S).next().faults)
         assert faults.keys() & {INTERNAL_ERROR, "frame set without a solution"}
         assert "a bug that some input shows" in caplog.text
-        n = len(poses.items)
-        until(lambda: is_tracked_again(server, frames, poses, n))
+        send_until_tracked(server, client, frames)
 
 
 def test_a_request_that_fails_is_answered_at_once(tmp_path: Path, caplog):
     """Before: its sender waited for the timeout."""
     with serving(config(tmp_path)) as (server, client):
         server.transport.answer_on_server_thread("test/broken", lambda query: raise_error() or b"")
-        reply = until(lambda: next(iter(client.session.get("test/broken", timeout=DEADLINE_S)), None))
+        reply = wait_for(lambda: next(iter(client.session.get("test/broken", timeout=DEADLINE_S)), None))
         assert reply is not None
         assert reply.err is not None
         assert "internal error (ValueError)" in reply.err.payload.to_string()

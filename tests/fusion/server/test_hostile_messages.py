@@ -23,8 +23,9 @@ from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from fusion.protocol.pose_messages import robots_key, set_robots_key
 from tests.conftest import ROOT
-from tests.fusion.serving import ARENA, DEADLINE_S, KEYS, config, live, serving_process
-from tests.waiting import wait_for
+from tests.fusion.serving import ARENA, KEYS, config, live, serving_process
+from tests.processes import killed_at_end
+from tests.waiting import DEADLINE_S, wait_for
 
 DETECTIONS = msgspec.msgpack.decode(encode(live(ARENA.messages(1))[0]))
 MAX_GROWTH_MB = 250.0  # of a process: what the queues of a few keys hold of the largest messages
@@ -72,12 +73,9 @@ def payloads() -> Iterator[bytes]:
 def recording(endpoint: str, out: Path) -> Iterator[subprocess.Popen]:
     """`fusion record` in a process of its own."""
     words = ["record", str(out), "--connect", endpoint, "--arena", "test"]
-    with subprocess.Popen([sys.executable, "-m", "fusion", *words], cwd=ROOT) as process:
-        try:
-            wait_for(out.exists)
-            yield process
-        finally:
-            process.kill()
+    with killed_at_end([sys.executable, "-m", "fusion", *words], cwd=ROOT) as process:
+        wait_for(out.exists)
+        yield process
 
 
 def attack(session: zenoh.Session) -> None:

@@ -6,7 +6,8 @@ import time
 from pathlib import Path
 
 from fusion.client.arena import Arena as Client
-from tests.fusion.arena_process import ServerProcess, cameras_at
+from tests.fusion.arena_process import cameras_at, saving
+from tests.fusion.serving import ServerProcess
 from tests.fusion.synthetic import WIDE
 from tests.waiting import Inbox, slowness
 
@@ -15,23 +16,23 @@ RETURN_S = 1.0  # after the server listens again, until all poses are back
 
 def test_poses_return_after_the_server_was_killed(tmp_path: Path):
     """Robot b was defined over the network, so only the saved robots have it."""
-    server = ServerProcess(tmp_path)
-    try:
-        with Client.connect(server.endpoint, arena="test") as client, cameras_at(server.endpoint):
-            poses = Inbox()
-            client.poses().on_message(lambda pose: poses.put((time.monotonic(), pose)))
+    with (
+        ServerProcess(saving(tmp_path)) as server,
+        Client.connect(server.endpoint, arena="test") as client,
+        cameras_at(server.endpoint),
+    ):
+        poses = Inbox()
+        client.poses().on_message(lambda pose: poses.put((time.monotonic(), pose)))
 
-            def tracked_between(begin_s: float, end_s: float = math.inf) -> set[str]:
-                return {p.robot for t, p in poses.items if begin_s < t <= end_s and p.state == "tracked"}
+        def tracked_between(begin_s: float, end_s: float = math.inf) -> set[str]:
+            return {p.robot for t, p in poses.items if begin_s < t <= end_s and p.state == "tracked"}
 
-            client.change_robots(define={"b": WIDE})
-            assert poses.until(lambda _: tracked_between(0.0) == {"a", "b"})
-            server.kill()
-            began_s = time.monotonic()
-            server.start(server.endpoint)
-            listens_s = time.monotonic()
-            assert poses.until(lambda _: tracked_between(began_s) == {"a", "b"})
-            first_s = min(t for t, _ in poses.items if tracked_between(began_s, t) == {"a", "b"})
-            assert first_s - listens_s < RETURN_S * slowness()
-    finally:
+        client.change_robots(define={"b": WIDE})
+        assert poses.until(lambda _: tracked_between(0.0) == {"a", "b"})
         server.kill()
+        began_s = time.monotonic()
+        server.start()
+        listens_s = time.monotonic()
+        assert poses.until(lambda _: tracked_between(began_s) == {"a", "b"})
+        first_s = min(t for t, _ in poses.items if tracked_between(began_s, t) == {"a", "b"})
+        assert first_s - listens_s < RETURN_S * slowness()

@@ -25,17 +25,10 @@ from fusion.server.arena_config import ArenaConfig
 from fusion.server.arena_queries import RIG_ANSWERS_HZ
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import free_port
-from tests.fusion.serving import (
-    ARENA,
-    DEADLINE_S,
-    KEYS,
-    config,
-    run_program,
-    serving,
-    serving_process,
-)
+from tests.fusion.serving import ARENA, KEYS, config, serving, serving_process
 from tests.fusion.unknown_robot import serving_an_unknown_robot
-from tests.waiting import wait_for
+from tests.processes import run_program
+from tests.waiting import DEADLINE_S, wait_for
 
 OTHER = Rig(
     cameras={

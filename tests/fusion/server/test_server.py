@@ -24,19 +24,18 @@ from tests.conftest import ROOT
 from tests.fusion.serving import (
     ARENA,
     ATTEMPT_S,
-    DEADLINE_S,
     KEYS,
     config,
     connected,
     later,
     live,
+    running_server,
     send,
     send_until_tracked,
     serving,
-    until,
 )
 from tests.processes import running
-from tests.waiting import Inbox, wait_for
+from tests.waiting import DEADLINE_S, Inbox, wait_for
 
 
 def test_detections_become_poses_and_markers(tmp_path):
@@ -51,7 +50,7 @@ def test_detections_become_poses_and_markers(tmp_path):
         markers.on_message(lambda _: received[1].set())
         send(server, live(ARENA.messages(30)))
         assert all(event.wait(DEADLINE_S) for event in received)
-        until(lambda: status.next().cameras.keys() == ARENA.cameras.keys())
+        wait_for(lambda: status.next().cameras.keys() == ARENA.cameras.keys())
         pose = robot.latest()
         assert pose is not None
         assert np.abs(np.subtract(pose.position, (0.2, 0.1, 0.2))).max() < 3e-3
@@ -65,7 +64,7 @@ def test_the_parts_of_the_latency_add_up_to_the_age_of_the_newest_exposure(tmp_p
         client.robot("a").on_pose(poses.append)
         begin_ns = time.time_ns()
         send(server, live(ARENA.messages(30), ago_ns=10**9))
-        until(lambda: client.status(DEADLINE_S).next().robots.get("a") == "tracked")
+        wait_for(lambda: client.status(DEADLINE_S).next().robots.get("a") == "tracked")
         elapsed_ms = (time.time_ns() - begin_ns) * 1e-6
     with_frames = [pose.latency for pose in poses if pose.latency is not None]
     assert with_frames
@@ -93,7 +92,7 @@ def test_invalid_detections_are_counted_and_skipped(tmp_path):
             "unknown camera": 1,
             "wrong image size": 1,
         }
-        until(lambda: status.next().faults == expected)
+        wait_for(lambda: status.next().faults == expected)
 
 
 def test_a_frame_set_without_a_solution_costs_the_tracks_but_not_the_server(tmp_path):
@@ -110,7 +109,7 @@ def test_a_frame_set_without_a_solution_costs_the_tracks_but_not_the_server(tmp_
         tracker = server.pipeline.tracker
         assert tracker is not None
         server.transport.enqueue(lambda: tracker.table.states.P.fill(np.nan))
-        until(is_counted)
+        wait_for(is_counted)
         send_until_tracked(server, client, frames)
         assert max(status.faults.get(fault, 0) for status in statuses.items) == 1
 
@@ -140,11 +139,9 @@ def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, mon
         send_in_real_time(server, 30)
         done = threading.Event()
         server.transport.enqueue(done.set)  # after all frames
-        thread = threading.Thread(target=server.run)
-        thread.start()
-        try:
+        with running_server(server):
             assert done.wait(DEADLINE_S)
-            until(
+            wait_for(
                 lambda: (
                     client.status(DEADLINE_S).next()
                     and any(s.frame_sets_per_s > 0 or TOO_SLOW in s.faults for s in statuses)
@@ -152,9 +149,6 @@ def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, mon
             )
             assert any(status.faults.get(TOO_SLOW, 0) for status in statuses) == drops
             assert drops or any(pose.state == "tracked" for pose in poses)
-        finally:
-            server.stop()
-            thread.join(DEADLINE_S)
 
 
 def test_the_clock_is_answered(tmp_path):
@@ -227,10 +221,10 @@ def test_each_pose_is_published_once_with_others_and_once_on_its_robots_key(tmp_
                 "test/**", lambda s: alone.put((str(s.key_expr), s.payload.to_bytes()))
             ),
         ]
-        until(lambda: client.status(DEADLINE_S).next())
+        wait_for(lambda: client.status(DEADLINE_S).next())
         send(server, live(ARENA.messages(12)))
-        until(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
-        until(lambda: client.status(DEADLINE_S).next())
+        wait_for(lambda: client.robot("a", DEADLINE_S).next().state == "tracked")
+        wait_for(lambda: client.status(DEADLINE_S).next())
         for subscriber in subscribers:
             subscriber.undeclare()
     single = Counter(data for key, data in alone.items if key == KEYS.robot_pose("a"))
@@ -244,7 +238,7 @@ def test_undecodable_poses_are_counted(tmp_path):
     with serving(config(tmp_path)) as (server, client):
         server.session.put(KEYS.poses, b"nonsense")
         status = client.status(DEADLINE_S)
-        until(lambda: status.next() and client.faults["RobotPoses"] == 1)
+        wait_for(lambda: status.next() and client.faults["RobotPoses"] == 1)
 
 
 def test_the_process_of_the_server_has_no_threads_for_linear_algebra():

@@ -23,17 +23,9 @@ from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
-from tests.fusion.serving import (
-    ARENA,
-    DEADLINE_S,
-    config,
-    connected,
-    run_program,
-    send_until_tracked,
-    serving,
-    until,
-)
-from tests.waiting import wait_for
+from tests.fusion.serving import ARENA, config, connected, send_until_tracked, serving
+from tests.processes import run_program
+from tests.waiting import DEADLINE_S, wait_for
 
 pytestmark = pytest.mark.computed
 
@@ -86,7 +78,7 @@ def test_subscribers_receive_the_rig_of_the_server_only(tmp_path: Path):
     with serving(config(tmp_path)) as (server, client), connected(server) as other:
         received = []
         subscriber = other.session.declare_subscriber(server.keys.rig, received.append)
-        until(lambda: client.set_rig(FEWER) and received)
+        wait_for(lambda: client.set_rig(FEWER) and received)
         other.session.put(server.keys.rig, received[0].payload)
         client.set_rig(GIVEN)
         assert client.rig(DEADLINE_S) == GIVEN
@@ -143,7 +135,7 @@ def test_undo_of_a_correction_restores_the_camera_and_no_longer_monitors_it(tmp_
         with pytest.raises(RequestError, match="no earlier version"):
             client.undo_rig()
         server.transport.enqueue(lambda: server.pipeline.active_rig.correct("cam1", MOVED, 1))
-        until(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == MOVED)
+        wait_for(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == MOVED)
         where = ("--connect", server.endpoints[0], "--arena", "test")
         done = run_program("fusion", "undo", *where)
         expected = (
@@ -302,7 +294,7 @@ def test_a_viewer_that_missed_a_publication_requests_the_rig(tmp_path: Path):
     """The status tells since when the rig is in force."""
     with serving(config(tmp_path)) as (_, client):
         t_ns = client.set_rig(FEWER).t_ns
-        until(lambda: client.status(DEADLINE_S).next().rig_t_ns == t_ns)
+        wait_for(lambda: client.status(DEADLINE_S).next().rig_t_ns == t_ns)
 
 
 def test_without_a_server_a_request_fails(endpoint: str):
