@@ -21,9 +21,8 @@ from calib.rig.rig_messages import RigMessage
 from camera_node.protocol.messages import decode
 from tests.web.browser import FLAGS, loopback
 from web.page import add_replay_page
-from web.state.feed import Feed
-from web.state.messages import DemoProgress
-from web.state.replay import RecordingPlayer
+from web.state.feed import DemoProgress, Feed
+from web.state.recording_player import RecordingPlayer
 from web.view import SLOW_INTERVAL, View
 
 OUT = Path(__file__).with_name("demo.webp")

@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 
 from tests.waiting import DEADLINE_S, wait_for
-from web.demo.demo import Demo, conclude
+from web.demo.arena_demo import Demo, conclude
 
 
 def run_demo(scene: Path, *arguments: str, timeout_s: float = 150.0) -> subprocess.CompletedProcess[str]:

@@ -14,10 +14,9 @@ from camera_node.foundation.service import ServiceManager
 from web.errors import PortError, WebError
 from web.html_tables import READ_ONLY_STYLE
 from web.page_access import PageAccess, current_role, guarding
-from web.scene.cameras import CameraDrawing
-from web.scene.markers import MarkerCloud, MarkerDiscs, TruePoints
-from web.scene.relative import RelativeFrames
-from web.scene.robots import RobotDrawing
+from web.scene.camera_frustums import CameraDrawing
+from web.scene.markers import MarkerCloud, MarkerDiscs, RelativeFrames, TruePoints
+from web.scene.robot_drawing import RobotDrawing
 from web.scene.surroundings import add_floor, add_lights
 from web.scene.viewpoint import Viewpoints
 from web.state.feed import ArenaState, Feed

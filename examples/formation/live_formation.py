@@ -45,7 +45,7 @@ from formation.formation_robots import (
 )
 from fusion.client import Arena
 from web.errors import WebError
-from web.state.messages import DemoProgress, progress_key
+from web.state.feed import DemoProgress, progress_key
 
 ARENA = "formation"
 USUAL, ANY_PORT = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:0"

@@ -28,8 +28,7 @@ from camera_node.protocol.messages import CameraStatus, Detections, decode
 from tests.conftest import free_port
 from tests.waiting import wait_for_port
 from tests.web.browser import CHROMIUM, FLAGS
-from web.demo.demo import ANY_PORT, Demo
-from web.demo.failures import interrupt_on_signals
+from web.demo.arena_demo import ANY_PORT, Demo, interrupt_on_signals
 
 BUSY = "while True: pass"
 STAY_OPEN = "--remote-debugging-port=0"

@@ -22,13 +22,12 @@ from tests.waiting import repeating
 from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import browsing, loopback, showing
 from web.errors import WebError
-from web.scene.cameras import CameraDrawing
+from web.scene.camera_frustums import CameraDrawing
 from web.state.feed import Feed
 from web.state.subscription import Subscription
-from web.tabs.calibrate import RigHistoryPanel
-from web.tabs.rig_change import CalibrationFiles, apply_rig
-from web.tabs.world import L_FRAME as BY_L_FRAME
-from web.tabs.world import STANDING, WorldPanel
+from web.tabs.calibration_panels import CalibrationFiles, RigHistoryPanel, apply_rig
+from web.tabs.world_panel import L_FRAME as BY_L_FRAME
+from web.tabs.world_panel import STANDING, WorldPanel
 from web.view import View
 
 ARENA = ring(3)

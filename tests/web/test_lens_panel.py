@@ -16,9 +16,9 @@ from tests.waiting import repeating
 from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import browsing, showing
 from web.state.subscription import Subscription
-from web.tabs.cameras import CameraSettings
+from web.tabs.calibration_panels import CalibrationFiles
+from web.tabs.camera_tab import CameraSettings
 from web.tabs.lens import describe_lens
-from web.tabs.rig_change import CalibrationFiles
 from web.view import View
 
 N_VIEWS = 12  # that differ

@@ -19,7 +19,7 @@ from tests.waiting import DEADLINE_S, wait_for
 from tests.web.browser import browsing, showing
 from web.state.feed import Feed
 from web.state.subscription import Subscription
-from web.tabs.cameras import CameraTable
+from web.tabs.camera_tab import CameraTable
 from web.tabs.marker_picker import MarkerPicker
 from web.view import View
 

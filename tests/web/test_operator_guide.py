@@ -15,12 +15,11 @@ from camera_node.foundation.config import example_file
 from camera_node.protocol.server_connection import ServerConnection
 from tests.conftest import ROOT
 from tests.web.browser import loopback
-from web.page import add_live_page
+from web.page import TABS, add_live_page
 from web.roundel.command import execute
 from web.state.feed import Feed
 from web.state.subscription import Subscription
-from web.tabs.header import TABS
-from web.tabs.rig_change import CalibrationFiles
+from web.tabs.calibration_panels import CalibrationFiles
 from web.view import View
 
 ROW = re.compile(r"^\| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", re.MULTILINE)
@@ -53,8 +52,8 @@ COMMAND_TESTS = {
     "recordings list": ("tests/web/test_record_tab.py", 'recordings("list"'),
     "recordings rename": ("tests/web/test_record_tab.py", 'recordings("rename"'),
     "recordings remove": ("tests/web/test_record_tab.py", 'recordings("remove"'),
-    "view": ("tests/web/state/test_replay.py", "headless"),
-    "trim": ("tests/web/state/test_replay.py", "trim("),
+    "view": ("tests/web/state/test_recording_player.py", "headless"),
+    "trim": ("tests/web/state/test_recording_player.py", "trim("),
     "replay": ("tests/fusion/recordings/test_record.py", "replay(tmp_path"),
     "doctor": ("tests/fusion/diagnosis/test_health.py", '"doctor"'),
 }

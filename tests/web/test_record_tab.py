@@ -22,12 +22,12 @@ from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import browsing, drawing, loopback, value_of
 from web.condition import Condition
-from web.history import LENGTH_S, EventLog, FigureHistory
 from web.html_tables import HtmlTable
 from web.page import add_live_page
 from web.state.feed import Feed
 from web.state.subscription import Subscription
-from web.tabs.record import tabulate_recordings
+from web.tabs.record_tab import tabulate_recordings
+from web.tabs.status_tab import LENGTH_S, EventLog, FigureHistory
 from web.view import View
 
 EXPORT_MS = 120_000  # on a busy machine: a process starts and fuses the recording

@@ -11,9 +11,8 @@ from tests.camera_node.protocol.positions import pack_random
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import loopback
-from web.scene.relative import located_frames
-from web.state.feed import Feed
-from web.state.messages import DemoProgress, progress_key
+from web.scene.markers import located_frames
+from web.state.feed import DemoProgress, Feed, progress_key
 from web.view import View
 
 MOVING = Pose((1.0, 2.0, 0.2), (0.5, -0.5, 0.5, -0.5))

@@ -13,7 +13,7 @@ from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from web.colours import css, robot_colour
 from web.html_tables import TableRow, status_line
-from web.scene.trails import LENGTH, Trails, fade
+from web.scene.robot_drawing import LENGTH, Trails, fade
 from web.state.coverage_picture import CoveragePicture, montage
 from web.state.feed import ArenaState, Feed, TimedMessage
 from web.tables import (

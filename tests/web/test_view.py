@@ -24,9 +24,8 @@ from tests.web.arena import LiveArena, four_cameras
 from tests.web.browser import browsing, loopback
 from web.errors import WebError
 from web.scene.viewpoint import FIELD_OF_VIEW, MARGIN, USUAL_ROOM, default_viewpoint
-from web.state.feed import Feed
-from web.state.messages import DemoProgress, progress_key
-from web.tabs.cameras import decode_jpeg
+from web.state.feed import DemoProgress, Feed, progress_key
+from web.tabs.camera_tab import decode_jpeg
 from web.view import View, check_port
 
 

@@ -24,7 +24,7 @@ from tests.web.arena import LiveArena
 from tests.web.browser import browsing, loopback, showing
 from web.errors import WebError
 from web.state.subscription import Subscription
-from web.tabs.rig_change import CalibrationFiles
+from web.tabs.calibration_panels import CalibrationFiles
 from web.tabs.wand_session import (
     WandSessionPanel,
     calibrate_cameras,

@@ -43,6 +43,6 @@ class RunDemo:
         if self.relative:
             sys.path.append(str(shipped_path("examples")))
             return import_module("formation.live_formation").run_formation(self.listen, page, self.seconds)
-        from web.demo.demo import run_demo
+        from web.demo.arena_demo import run_demo
 
         return run_demo(self.scene or example_file("demo/scene.yaml"), self.listen, page, self.seconds)

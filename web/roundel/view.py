@@ -12,7 +12,7 @@ from camera_node.foundation.service import stopped_by_signals
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from web.roundel.demo import RunDemo
 from web.state.feed import Feed
-from web.state.replay import RecordingPlayer
+from web.state.recording_player import RecordingPlayer
 from web.state.subscription import Subscription
 from web.tables import describe_arena
 

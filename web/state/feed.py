@@ -15,7 +15,9 @@ import msgspec
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigHistory, RigMessage
 from camera_node.foundation.errors import printable
+from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import (
+    VERSION,
     CameraStatus,
     Detections,
     Keys,
@@ -25,9 +27,8 @@ from camera_node.protocol.messages import (
     decode,
 )
 from fusion.model.robots import Robot
-from fusion.protocol.pose_messages import FusionStatus, Markers, RobotPose, Robots, robots_key
+from fusion.protocol.pose_messages import MAX_NUMBER, FusionStatus, Markers, RobotPose, Robots, robots_key
 from web.state.coverage_picture import CoveragePicture
-from web.state.messages import DemoProgress, progress_key
 
 log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
@@ -36,6 +37,17 @@ REMOVED_CAMERA_S = 5.0  # the same of a camera without a status
 MAX_PENDING = 1024  # keys whose latest message is not decoded yet
 COVERAGE_S = 0.1  # shortest time between two frames of a camera that extend its coverage
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
+_CONTAINERS = (
+    "poses",
+    "cameras",
+    "previews",
+    "relative",
+    "detections",
+    "coverage",
+    "message_counts",
+    "faults",
+)
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -93,7 +105,7 @@ class Feed:
     """Decodes the messages of an arena and stores the latest of each kind.
 
     Messages arrive through `receive`, from Zenoh (`web.state.subscription`) or from a recording
-    (`web.state.replay`). Invalid messages are counted in `ArenaState.faults` and have no other effect. Poses,
+    (`web.state.recording_player`). Invalid messages are counted in `ArenaState.faults` and have no other effect. Poses,
     markers and detections arrive far more often than they are drawn: of each key, only the latest message is
     decoded, by `state`. All methods are thread-safe.
     """
@@ -269,21 +281,37 @@ class Feed:
         messages[name] = TimedMessage(message, self._received_s)
 
 
-_CONTAINERS = (
-    "poses",
-    "cameras",
-    "previews",
-    "relative",
-    "detections",
-    "coverage",
-    "message_counts",
-    "faults",
-)
-
-
 def _check_name(known: dict[str, Any], name: str, key: str) -> None:
     """Raise MessageError if the name in a message differs from its key's, or if there are too many names."""
     if f"/{name}/" not in key or not name:
         raise MessageError(f"a name that differs from the one in the key {key}")
     if name not in known and len(known) >= MAX_NAMES:
         raise MessageError(f"more than {MAX_NAMES} names")
+
+
+class DemoProgress(msgspec.Struct, frozen=True, kw_only=True):
+    """A status line, the completed share of the current step, true marker positions and poses of moving cameras.
+
+    `true_points` maps the name of a simulated object to its marker positions in the world, metres, and `true_cameras`
+    the name of a camera that moves, which no rig can have, to its pose in the world. The viewer draws them. The
+    encoding is that of `camera_node.protocol.messages`.
+    """
+
+    version: int = VERSION
+    t_ns: int
+    text: str
+    share: float  # completed part of the current step, 0 to 1
+    true_points: dict[str, tuple[Vector, ...]] = {}
+    true_cameras: dict[str, Pose] = {}
+
+    def check(self) -> None:
+        """Raise MessageError unless `share` is within 0 to 1 and all coordinates are in range."""
+        places = [point for points in self.true_points.values() for point in points]
+        places += [pose.position_m for pose in self.true_cameras.values()]
+        if not (0.0 <= self.share <= 1.0 and all(abs(x) <= MAX_NUMBER for place in places for x in place)):
+            raise MessageError("a share outside 0 to 1, or a true position out of range")
+
+
+def progress_key(arena: str) -> str:
+    """The Zenoh key of `DemoProgress`."""
+    return f"{arena}/demo/progress"

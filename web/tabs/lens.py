@@ -25,7 +25,7 @@ from web.errors import WebError
 from web.html_tables import COLOURS, MARGIN_PX, small
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
-from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
+from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
 from web.widgets import ActionButton, Answer, LongAction, set_content, set_property
 
 BOARD = "charuco:5x7:0.035"  # of `roundel print board`

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from calib.intrinsics.nominal_lens import load_known_lenses, with_nominal_lenses
 from calib.live.collect import running_camera_sizes
@@ -17,18 +18,18 @@ from calib.live.trials import WandSession
 from calib.live.wand_position import locate_wand
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig, save_rig
+from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import load_yaml
 from camera_node.geometry.body import Body, PrintedWand
-from web.colours import PREVIEW
+from web.colours import PREVIEW, WAND_TRAIL
 from web.commands import run_program
 from web.condition import next_step
 from web.errors import WebError
 from web.html_tables import Column, HtmlTable, TableRow
-from web.scene.cameras import CameraDrawing
-from web.scene.wand import WandDrawing
+from web.scene.camera_frustums import CameraDrawing
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
-from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
+from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
 from web.widgets import ActionButton, Answer, LongAction, set_content
 
 SOLVE_S = 600.0  # limit for `roundel calibrate wand`
@@ -42,6 +43,8 @@ WAND_COLUMNS = (
 ALL = "all cameras"
 ONLY_ADVICE = "wave the wand in front of {0} and its neighbours for 10 to 20 s, then end the session"
 LABELS = ("Start wand session", "End wand session")
+MAX_TRAIL = 1500  # places; at five a second, a session of five minutes
+MARKER_M, TRAIL_M, LINE_M = 0.05, 0.025, 0.02
 
 
 class WandSessionPanel:
@@ -223,3 +226,50 @@ def describe_calibration(calibration: dict[str, Any]) -> str:
             "make sure that no program sets it, and record a new wand session"
         )
     return text
+
+
+class WandDrawing:
+    """The wand in the scene; nothing before the first `draw`."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self._trail = np.empty((0, 3), np.float32)
+        self._handles: dict[str, viser.SceneNodeHandle] = {}
+
+    @property
+    def n_places(self) -> int:
+        """Number of places in the trail."""
+        return len(self._trail)
+
+    def clear(self) -> None:
+        """Remove the wand and its trail."""
+        self._trail = np.empty((0, 3), np.float32)
+        for handle in self._handles.values():
+            handle.remove()
+        self._handles = {}
+
+    def draw(self, markers: Array | None) -> None:
+        """Draw the markers (M, 3), world, of which those that are NaN were not seen; None hides the wand."""
+        points = np.empty((0, 3)) if markers is None else markers[np.isfinite(markers[:, 0])]
+        for name in ("markers", "line"):
+            if name in self._handles:
+                self._handles.pop(name).remove()
+        if not len(points):
+            return
+        points = np.asarray(points, np.float32)
+        self._handles["markers"] = self._add_points("markers", points, PREVIEW, MARKER_M)
+        if len(points) > 1:
+            ends = points[[np.linalg.norm(points - points[0], axis=1).argmax(), 0]]
+            self._handles["line"] = self._scene.add_line_segments(
+                "/wand/line", ends[None], PREVIEW, thickness=LINE_M
+            )
+        trail = np.concatenate([self._trail, points.mean(axis=0, keepdims=True)])
+        self._trail = np.asarray(trail[-MAX_TRAIL:], np.float32)
+        self._handles["trail"] = self._add_points("trail", self._trail, WAND_TRAIL, TRAIL_M)
+
+    def _add_points(
+        self, name: str, points: NDArray[np.float32], colour: tuple[int, int, int], size_m: float
+    ) -> viser.PointCloudHandle:
+        return self._scene.add_point_cloud(
+            f"/wand/{name}", points, colour, point_size=size_m, point_shape="circle", precision="float32"
+        )

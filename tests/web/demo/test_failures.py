@@ -17,9 +17,15 @@ from camera_node.geometry.pose import Pose
 from camera_node.simulation.scene import Scene
 from tests.conftest import free_port
 from tests.waiting import wait_for
-from web.demo.demo import Demo, calibrated_lenses, require_poses
-from web.demo.failures import ProgramFailed, interrupt_on_signals, raise_failure
-from web.demo.usage import ResourceUsage
+from web.demo.arena_demo import (
+    Demo,
+    ProgramFailed,
+    calibrated_lenses,
+    interrupt_on_signals,
+    raise_failure,
+    require_poses,
+)
+from web.demo.score import ResourceUsage
 from web.errors import WebError
 from web.state.feed import Feed
 

@@ -6,8 +6,7 @@ import pytest
 
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
 from fusion.protocol.pose_messages import RobotPose, TrackingState
-from web.demo.score import PoseScore, angle_deg, longest_gap_s, summarize
-from web.demo.usage import describe_overload
+from web.demo.score import PoseScore, angle_deg, describe_overload, longest_gap_s, summarize
 
 SECOND = 10**9
 ROBOTS = {"rover": 3, "puck": 1}

@@ -13,7 +13,7 @@ from fusion.model.robots import Robot, load_robots
 from fusion.protocol.pose_messages import Markers, RobotPose
 from web.colours import CARD, CARD_UNSEEN
 from web.scene.bodies import Mesh, box_mesh, cylinder_mesh, enclosing_part
-from web.scene.robots import RobotDrawing
+from web.scene.robot_drawing import RobotDrawing
 from web.state.feed import ArenaState, TimedMessage
 
 CUBE = load_robots(example_file("cube/robots.yaml"))["cube"]

@@ -7,8 +7,7 @@ from camera_node.protocol.messages import encode
 from tests.calib.rig.hostile import as_publication, hostile_messages
 from tests.waiting import wait_for
 from tests.web.arena import ArenaMessages, LiveArena, four_cameras
-from web.state.feed import MAX_PENDING, MAX_REASONS, REMOVED_CAMERA_S, Feed
-from web.state.messages import DemoProgress, progress_key
+from web.state.feed import MAX_PENDING, MAX_REASONS, REMOVED_CAMERA_S, DemoProgress, Feed, progress_key
 from web.state.subscription import Subscription
 
 pytestmark = pytest.mark.computed

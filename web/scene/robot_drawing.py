@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Draws robots with batched Viser handles, which cost 1/20 of single ones."""
+"""Draws robots and their trails with batched Viser handles, which cost 1/20 of single ones."""
 
 from typing import Any
 
@@ -11,7 +11,6 @@ from camera_node.geometry.pose import rotation_from_wxyz, rotation_with_z
 from fusion.model.robots import Robot
 from web.colours import BACKGROUND, CARD, CARD_UNSEEN, own_colours, robot_colours
 from web.scene.bodies import FixedParts, Part, box_mesh, cylinder_mesh, enclosing_part, ring_mesh
-from web.scene.trails import Trails, fade
 from web.state.feed import ArenaState
 from web.tables import robot_state
 
@@ -22,6 +21,9 @@ LABEL_OFFSET_M = np.array([0.0, 0.0, 0.16])
 LABEL_SCALE = 0.8
 LABEL_STEP_M = 0.01  # a label follows its robot in steps of so much
 MAX_LABELS = 20  # moved in one slow drawing
+LENGTH = 60  # positions of one trail
+JUMP_M = 1.0  # a longer step is a jump, not motion: the trail restarts
+FADE_EXPONENT = 1.5
 
 
 class RobotDrawing:
@@ -173,3 +175,38 @@ def _poses(state: ArenaState, names: list[str]) -> tuple[NDArray[np.float32], ND
     poses = [state.poses[name].message for name in names]
     positions = np.array([pose.position for pose in poses], np.float32).reshape(-1, 3)
     return positions, np.array([pose.quaternion_wxyz for pose in poses], np.float32).reshape(-1, 4)
+
+
+class Trails:
+    """The last `LENGTH` positions of each robot. A trail restarts where a robot jumps."""
+
+    def __init__(self) -> None:
+        self._points: dict[str, NDArray[np.float32]] = {}
+
+    def add(self, robot: str, position: ArrayLike) -> None:
+        """Append a position (3,), metres, and drop the oldest."""
+        new = np.asarray(position, np.float32)
+        points = self._points.get(robot)
+        if points is None:
+            self._points[robot] = np.tile(new, (LENGTH, 1))
+        elif np.linalg.norm(new - points[-1]) > JUMP_M:  # moved by hand, or a replay that jumped
+            points[:] = new
+        else:
+            points[:-1], points[-1] = points[1:].copy(), new
+
+    def remove(self, robot: str) -> None:
+        """Forget a robot."""
+        self._points.pop(robot, None)
+
+    def segments(self, robots: list[str]) -> NDArray[np.float32]:
+        """Return the trails of robots that were added: (len(robots) * (LENGTH - 1), 2, 3), the oldest first."""
+        lines = [np.stack([p[:-1], p[1:]], axis=1) for p in (self._points[robot] for robot in robots)]
+        return np.concatenate(lines) if lines else np.empty((0, 2, 3), np.float32)
+
+
+def fade(colours: NDArray[np.uint8], background: ArrayLike) -> NDArray[np.uint8]:
+    """Return the segments' colours for R robots, (R * (LENGTH - 1), 2, 3), from the background to the robot's own."""
+    share = np.linspace(0.0, 1.0, LENGTH) ** FADE_EXPONENT
+    lines = colours[:, None] * share[:, None] + np.asarray(background, float) * (1 - share[:, None])
+    pairs = np.stack([lines[:, :-1], lines[:, 1:]], axis=2)
+    return pairs.reshape(-1, 2, 3).astype(np.uint8)

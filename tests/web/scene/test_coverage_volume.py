@@ -8,7 +8,7 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.geometry.pose import Pose, look_at
 from tests.waiting import wait_for
-from web.scene.coverage import MANY, SINGLE, CoverageVolume, colours, covered_points
+from web.scene.coverage_volume import MANY, SINGLE, CoverageVolume, colours, covered_points
 from web.state.feed import ArenaState
 
 LENS = {"width": 1280, "height": 800, "fx": 900.0, "fy": 900.0, "cx": 639.5, "cy": 399.5}

@@ -20,9 +20,9 @@ from tests.web.browser import loopback
 from web.errors import WebError
 from web.roundel.view import ViewArena
 from web.state.feed import Feed
-from web.state.replay import RecordingPlayer
+from web.state.recording_player import RecordingPlayer
 from web.tables import tabulate_robots
-from web.tabs.replay_controls import ReplayControls
+from web.tabs.record_tab import ReplayControls
 from web.view import View
 
 HZ, SECONDS = 10, 20

@@ -7,21 +7,27 @@ The arena is one of `roundel up` in a temporary folder. Read `Demo.run` first: i
 import contextlib
 import os
 import shutil
+import signal
 import tempfile
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
+import zenoh
 from msgspec.structs import replace
 
 from calib.live.rig_requests import set_rig
-from calib.rig.camera import Camera, with_distortion
+from calib.rig.camera import Camera, transform, with_distortion
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import align_cameras
-from camera_node.foundation.errors import NetworkError
+from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import TEMPORARY_FAILURE, USER_ERROR, NetworkError
 from camera_node.foundation.supervisor import Supervisor, log_path
+from camera_node.protocol.messages import encode
 from camera_node.protocol.server_connection import ServerConnection
 from camera_node.protocol.session import CONNECT_S
 from camera_node.simulation.scene import Scene
@@ -30,18 +36,9 @@ from fusion.protocol.pose_messages import RobotPose
 from fusion.server.arena_config import load_arena
 from web.arena_folder import ArenaFolder
 from web.arena_programs import CALIBRATION, ArenaPrograms
-from web.demo.failures import ProgramFailed, interrupt_on_signals, quote_end, raise_failure
-from web.demo.progress import (
-    ProgressReporter,
-    SceneClock,
-    describe_calibration_step,
-    describe_errors,
-    describe_tracking_step,
-)
-from web.demo.score import PoseScore, summarize
-from web.demo.usage import ResourceUsage, describe_overload
+from web.demo.score import PoseScore, ResourceUsage, describe_overload, summarize
 from web.errors import WebError
-from web.state.feed import Feed
+from web.state.feed import ArenaState, DemoProgress, Feed, progress_key
 from web.state.subscription import Subscription
 
 ARENA = "demo"
@@ -54,6 +51,8 @@ ACQUISITION_S = 5.0  # for all robots to be acquired; a robot that is not tracke
 TICK_S = 0.05
 # Errors of carefully calibrated lenses: relative focal length, principal point in pixels, k1.
 LENS_SIGMA = 6e-4, 0.5, 5e-4
+TAIL_LINES = 8  # of a log, that the message of a failure quotes
+RECENT = 100  # poses whose median latency is shown
 
 
 def run_demo(
@@ -293,3 +292,107 @@ class Demo:
             self._supervisor.tend()
             before, elapsed = elapsed, int(time.monotonic() - start)
             yield elapsed > before
+
+
+class ProgramFailed(Exception):
+    """A child stopped unexpectedly; the message quotes the end of its log."""
+
+
+def raise_failure(name: str, code: int, log: Path) -> None:
+    """Raise the error that describes how a child ended.
+
+    Raises:
+        WebError: with one line on a fault that the user can correct.
+        ProgramFailed: otherwise.
+    """
+    lines = log.read_text(errors="replace").strip().splitlines()
+    if code in (USER_ERROR, TEMPORARY_FAILURE) and lines and lines[-1].startswith("error: "):
+        raise WebError(f"{name}: {lines[-1].removeprefix('error: ')}")
+    raise ProgramFailed(f"{name} stopped with code {code}; {quote_end(log)}")
+
+
+def quote_end(log: Path) -> str:
+    """Name a log, and quote its last lines if it has any."""
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return "\n".join([f"its log is {log}", *(f"  {line}" for line in lines[-TAIL_LINES:])])
+
+
+@contextmanager
+def interrupt_on_signals() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGINT, SIGTERM and SIGHUP, so that `with` blocks clean up."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    before = [signal.signal(number, interrupt) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+class SceneClock:
+    """The simulated scene with its epoch: converts wall-clock time (ns) to scene time (s)."""
+
+    def __init__(self, scene: Scene, epoch_ns: int) -> None:
+        self.scene, self.epoch_ns = scene, epoch_ns
+
+    def seconds(self, t_ns: int | None = None) -> float:
+        """Return the scene time at `t_ns`, or now."""
+        return ((time.time_ns() if t_ns is None else t_ns) - self.epoch_ns) * 1e-9
+
+    def true_pose(self, robot: str, t_ns: int) -> Array | None:
+        """Return T_world_robot (4, 4), or None while the robot is not in the scene."""
+        return self.scene.robot_pose(robot, self.seconds(t_ns))
+
+    def wand_points(self) -> dict[str, tuple]:
+        """Return the wand's true marker positions by name, as in `DemoProgress`; empty without a wand."""
+        T = self.scene.wand_pose(self.seconds())
+        return {} if T is None else {"wand": tuple(map(tuple, transform(T, self.scene.wand.points).tolist()))}
+
+    def wand_share(self) -> float:
+        """Return the completed share of the wand session, 0 to 1."""
+        return min(1.0, max(0.0, self.seconds() / self.scene.wave_s))
+
+
+class ProgressReporter:
+    """Publishes status lines for the page and prints them."""
+
+    def __init__(self, session: zenoh.Session, arena: str, clock: SceneClock) -> None:
+        self._session, self._key, self._clock = session, progress_key(arena), clock
+
+    def report(self, text: str, share: float, print_text: bool) -> None:
+        """Publish a status line and the completed share of the step, 0 to 1; also print the line if wanted."""
+        points = self._clock.wand_points()
+        progress = DemoProgress(t_ns=time.time_ns(), text=text, share=share, true_points=points)
+        self._session.put(self._key, encode(progress))
+        if print_text:
+            print(text, flush=True)
+
+
+def describe_calibration_step(clock: SceneClock, state: ArenaState) -> str:
+    """Return the status line before, during and after the wand session."""
+    t_s, wave_s = clock.seconds(), clock.scene.wave_s
+    if t_s >= wave_s:
+        return f"the wand session is over; calibrating ({t_s - wave_s:.0f} s)"
+    if t_s < 0:
+        return f"starting programs; the wand session begins in {-t_s:.0f} s"
+    shares = ", ".join(f"{name} {100 * c.share:.0f} %" for name, c in sorted(state.coverage.items()))
+    return f"waving the wand, {t_s:.0f} of {wave_s:.0f} s; image coverage: {shares or 'no camera yet'}"
+
+
+def describe_errors(score: PoseScore) -> str:
+    """Return the robots' position errors for the page, which has all other figures itself."""
+    errors = ", ".join(f"{robot} {score.recent_mm(robot):.2f}" for robot in score.errors)
+    return f"simulation: position errors in mm: {errors}"
+
+
+def describe_tracking_step(score: PoseScore, usage: ResourceUsage, cameras: Iterable[str]) -> str:
+    """Return the status line while the robots are tracked."""
+    errors = ", ".join(f"{robot} {score.recent_mm(robot):.2f}" for robot in score.errors)
+    rates = " ".join(f"{rate:.0f}" for rate in usage.frame_rates(cameras).values())
+    latencies = score.latencies_ms[-RECENT:]
+    p50 = f"{np.median(latencies):.1f} ms" if latencies else "unknown"
+    return f"{usage.seconds():.0f} s: error mm {errors}; latency {p50}; frames/s {rates}"

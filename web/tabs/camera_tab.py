@@ -20,14 +20,14 @@ from camera_node.protocol.registration import CameraChange
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import guarded
 from web.html_tables import MARGIN_PX
-from web.scene.cameras import CameraDrawing
+from web.scene.camera_frustums import CameraDrawing
 from web.state.coverage_picture import montage
 from web.state.feed import ArenaState
 from web.state.subscription import REQUEST_TIMEOUT_S, Subscription
 from web.tables import STALE_S, tabulate_cameras
+from web.tabs.calibration_panels import CalibrationFiles
 from web.tabs.lens import LensPanel
 from web.tabs.mask_editor import MaskEditor
-from web.tabs.rig_change import CalibrationFiles
 from web.widgets import ActionButton, Answer, set_content, set_property
 
 NO_CAMERA = "no camera yet"

@@ -17,7 +17,7 @@ from web.errors import WebError
 from web.scene.surroundings import WorldPreview
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
-from web.tabs.rig_change import CalibrationFiles, apply_rig, current_rig
+from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
 from web.widgets import ActionButton, Answer
 
 COLLECT_S = 3.0
