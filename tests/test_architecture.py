@@ -10,8 +10,12 @@ from collections.abc import Iterable
 
 import pytest
 
+from tests import source_tree
 from tests.source_tree import PROGRAMS, imports, name_of, parse, python_files
 
+MAX_CHAIN = 10  # modules, from the one that imports to the one that imports none of its program
+SMALL = 60  # lines: such a module with one importer belongs into it
+SHARED_NAMES = {"errors.py"}  # each program's errors
 COMMON_TYPES = {"Array", "Index", "Mask", "Grey"}  # camera_node/foundation/arrays.py defines them
 
 
@@ -41,6 +45,30 @@ def test_no_constructor_receives_the_object_that_calls_it():
         and isinstance(node.func, ast.Name)
         and node.func.id.lstrip("_")[:1].isupper()
         and any(isinstance(argument, ast.Name) and argument.id == "self" for argument in node.args)
+    )
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_import_chains_are_short(program: str):
+    """A reader of one value walks along the imports."""
+    chain = source_tree.longest_chain(source_tree.import_graph(program))
+    assert len(chain) <= MAX_CHAIN, " -> ".join(chain)
+
+
+def test_a_small_module_has_several_importers():
+    importers = source_tree.count_importers(source_tree.import_graph(*PROGRAMS))
+    lengths = {source_tree.module_of(p): len(p.read_text().splitlines()) for p in python_files(*PROGRAMS)}
+    assert_none(
+        f"{module} has {lengths[module]} lines and one importer"
+        for module, count in importers.items()
+        if count == 1 and lengths[module] < SMALL
+    )
+
+
+def test_a_file_name_has_one_meaning():
+    recurring = source_tree.recurring_names(python_files(*PROGRAMS))
+    assert_none(
+        f"{name}: {', '.join(paths)}" for name, paths in recurring.items() if name not in SHARED_NAMES
     )
 
 
