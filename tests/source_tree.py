@@ -3,6 +3,7 @@
 
 import ast
 import itertools
+import re
 from collections import Counter
 from collections.abc import Iterable
 from functools import cache
@@ -10,6 +11,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = ("camera_node", "calib", "fusion", "web", "roundel")
+TARGET = re.compile(r"[a-z_0-9.]+:\w+$")  # of a command
 
 
 def python_files(*folders: str) -> list[Path]:
@@ -34,13 +36,18 @@ def parse(path: Path) -> ast.Module:
 
 
 def imports(path: Path) -> set[str]:
-    """The modules that a file imports; of `from a import b` both a and a.b, since b may be a module."""
+    """The modules that a file imports; of `from a import b` both a and a.b, since b may be a module.
+
+    A table of commands imports the targets that it names, such as "calib.commands.check:check", when they run.
+    """
     found: set[str] = set()
     for node in ast.walk(parse(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and TARGET.match(node.value):
+            found.add(node.value.split(":")[0])
     return found
 
 

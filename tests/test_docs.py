@@ -16,7 +16,7 @@ import yaml
 
 from calib.rig.rig import load_rig
 from calib.wand.quality.grade import LIMITS
-from camera_node.commands.camera import JoinArena
+from camera_node.commands.camera_command import JoinArena
 from tests.calib.stick import LENGTH_M, write_stick
 from tests.conftest import ROOT
 from tests.pages import commands, page

@@ -14,7 +14,7 @@ import tyro
 from camera_node.commands.publish import Publish
 from fusion.commands.serve import Serve
 from tests.conftest import ROOT
-from web.roundel.view import ViewArena
+from web.roundel.serve_page import ViewArena
 
 PROGRAMS: dict[str, Callable[[list[str]], object]] = {
     "roundel-fusion": lambda words: tyro.cli(Serve, args=words),

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from camera_node.commands.camera import LocalCameras, given_options
+from camera_node.commands.camera_command import LocalCameras, given_options
 from camera_node.foundation.errors import NetworkError
 from camera_node.foundation.supervisor import Supervisor
 from camera_node.sources.frame import SourceSettings

@@ -8,16 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+from rich.console import Group
 from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 from zenoh import Session
 
 from calib.commands.inputs import WandOptions, require_positive
 from calib.commands.output import check_folder, conclude, provenance, put_in_force, write_rig
-from calib.commands.printed_report import print_recalibration, print_report, save_maps, show_progress
+from calib.commands.printed_report import print_recalibration, print_report, save_maps
 from calib.errors import CalibrationError
 from calib.intrinsics.nominal_lens import FIELD_OF_VIEW_DEG, load_known_lenses, with_nominal_lenses
 from calib.live.collect import CollectedFrames, running_camera_sizes
-from calib.live.live_session import run_wand_session
+from calib.live.live_session import SessionProgress, run_wand_session
 from calib.live.trials import MAX_SECONDS, WandSession
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig
@@ -25,8 +28,8 @@ from calib.rig.wand_file import load_wand
 from calib.wand.bundle_adjustment.covariance import widen_lenses
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
-from calib.wand.recalibration import recalibrate_camera
 from calib.wand.scale import Distance
+from calib.wand.single_camera import recalibrate_camera
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import console, progress_console, say
 from camera_node.geometry.body import Body
@@ -216,3 +219,12 @@ class Wand(WandOptions):
         if self.distance is not None:
             words += ["--distance", *self.distance, "--distance-sigma", self.distance_sigma]
         return shlex.join(["roundel", "calibrate", "wand", *map(str, words), *flags])
+
+
+def show_progress(progress: SessionProgress) -> Group:
+    """The progress of a session: the frames and the area of each camera, the expected result, and advice."""
+    table = Table("camera", "frames", "image covered", "shared area used", "pose error / noise")
+    for cells in progress.cells():
+        table.add_row(*cells)
+    advice = Text(progress.advice, "green" if progress.enough else "yellow")
+    return Group(Text(progress.summary, "bold"), table, advice)

@@ -5,17 +5,14 @@ from pathlib import Path
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
-from rich.console import Group
 from rich.table import Table
-from rich.text import Text
 
 from calib.commands.output import save_image
 from calib.intrinsics.residual_plot import draw_residuals
-from calib.live.live_session import SessionProgress
 from calib.rig.precision_map import draw_precision
 from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
-from calib.wand.recalibration import Recalibration
+from calib.wand.single_camera import Recalibration
 from calib.wand.wand_report import WandCalibration, WandReport
 from camera_node.foundation.terminal import console, say
 
@@ -74,15 +71,6 @@ def print_recalibration(result: Recalibration) -> None:
         f"{result.name}: {moved}standard deviation of its position {result.sigma_mm:.1f} mm, "
         f"residual {result.residual_px:.2f} px"
     )
-
-
-def show_progress(progress: SessionProgress) -> Group:
-    """The progress of a session: the frames and the area of each camera, the expected result, and advice."""
-    table = Table("camera", "frames", "image covered", "shared area used", "pose error / noise")
-    for cells in progress.cells():
-        table.add_row(*cells)
-    advice = Text(progress.advice, "green" if progress.enough else "yellow")
-    return Group(Text(progress.summary, "bold"), table, advice)
 
 
 def _drifts(result: WandCalibration) -> list[str]:

@@ -9,7 +9,7 @@ COMMANDS = (
     Command(
         "camera",
         "add the cameras of this machine to an arena",
-        "camera_node.commands.camera:JoinArena",
+        "camera_node.commands.camera_command:JoinArena",
         (
             "roundel camera",
             "roundel camera --source 0 --connect tcp/server:7447",

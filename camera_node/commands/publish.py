@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from camera_node.commands.relative import RelativeSettings
+from camera_node.commands.relative_settings import RelativeSettings
 from camera_node.foundation.config import example_file, require_name
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.service import ServiceManager, StopEvent, stopped_by_signals

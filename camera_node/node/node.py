@@ -16,7 +16,7 @@ import zenoh
 from camera_node.detection.detector import Detector
 from camera_node.detection.overlay import draw_refused, draw_roundels
 from camera_node.detection.refusals import explain
-from camera_node.detection.relative import DiscLocalizer
+from camera_node.detection.relative_positions import DiscLocalizer
 from camera_node.foundation.errors import RoundelError
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.foundation.service import ServiceManager

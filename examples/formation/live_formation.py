@@ -18,7 +18,7 @@ import numpy as np
 import zenoh
 
 from camera_node.detection.detector import Detector
-from camera_node.detection.relative import DiscLocalizer
+from camera_node.detection.relative_positions import DiscLocalizer
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.foundation.service import stopped_by_signals

@@ -127,6 +127,20 @@ class Marker:
     diameter_m: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerHistories:
+    """What N markers did before: for how long they were tracked, seconds (N,), and how they moved (N,).
+
+    A marker that moves with others belongs to one body with them. One that is alone moved since the last anchor, and
+    none moved with it. The motions of anchored markers are compared.
+    """
+
+    age_s: Array
+    anchored: Mask
+    moves_with_others: Mask
+    alone: Mask
+
+
 GATE = 13.8  # chi-square with 2 degrees of freedom; rejects one true ray in 1000
 EQUAL_SIZES = 0.06  # relative: measured diameters of equal prints differ by noise and blur
 

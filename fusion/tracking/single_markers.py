@@ -10,15 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.states import POSITION
+from camera_node.foundation.arrays import Index, Mask
 from fusion.tracking.gating import DIAMETER_TOLERANCE, POSITION_GATE
-from fusion.tracking.rays import Marker
+from fusion.tracking.rays import Marker, MarkerHistories
 from fusion.tracking.track_table import TrackTable
-from fusion.tracking.unlabeled import MarkerHistories
 
-START_M = 0.1  # standard deviation of `start_m`
-LOCAL_M = 0.3  # position sigma above which a history does not say where a robot is
 WATCHED_S = 0.3  # a marker of a robot that may be anywhere must have been tracked for this time, or move
 
 Histories = Callable[[Sequence[Marker]], MarkerHistories]
@@ -53,7 +49,7 @@ def choose_markers(
     for row in np.flatnonzero(table.owned[missing]).tolist():
         k, options = int(missing[row]), np.flatnonzero(reach.chosen[row])
         others = np.flatnonzero(reach.chosen[:, options[0]]) if len(options) == 1 else np.empty(0, np.intp)
-        if len(others) == 1 and (is_local(table, k) or _is_watched(history, options[0])):
+        if len(others) == 1 and (table.is_local(k) or _is_watched(history, options[0])):
             choice.pairs[k] = int(options[0])
         else:
             rivals = [table.names[missing[r]] for r in others if r != row]
@@ -72,32 +68,13 @@ def _reach(table: TrackTable, missing: Index, markers: list[Marker], history: Ma
     return _Reach(sized, near, np.where(is_known[:, None], alone, within))
 
 
-def history_chi2(table: TrackTable, k: int, p: Array, covariance: Array) -> float:
-    """Squared Mahalanobis distance of p from the last position of robot k, or from its start if never acquired."""
-    position, own = table.states.p[k], table.states.P[k, POSITION, POSITION]
-    if table.status[k] is None:
-        start = table.robots[k].start_m
-        if start is None:
-            return 0.0
-        position, own = np.array(start), START_M**2 * np.eye(3)
-    error = p - position
-    return float(error @ np.linalg.solve(own + covariance, error))
-
-
 def _has_size(table: TrackTable, k: int, marker: Marker) -> bool:
     """Whether a marker has the size of robot k; True where its size is unknown."""
     return not abs(marker.diameter_m / table.robots[k].diameter_m - 1) >= DIAMETER_TOLERANCE
 
 
 def _is_near(table: TrackTable, k: int, marker: Marker) -> bool:
-    return history_chi2(table, k, marker.position, marker.covariance) < POSITION_GATE
-
-
-def is_local(table: TrackTable, k: int) -> bool:
-    """Whether its start or its history says where robot k is."""
-    if table.status[k] is None:
-        return table.robots[k].start_m is not None
-    return bool(np.trace(table.states.P[k, POSITION, POSITION]) < 3 * LOCAL_M**2)
+    return table.history_chi2(k, marker.position, marker.covariance) < POSITION_GATE
 
 
 def _is_watched(history: MarkerHistories, marker: int) -> bool:

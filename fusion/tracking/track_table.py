@@ -17,6 +17,8 @@ from fusion.tracking.gating import START_S, START_SIGMAS
 MAX_COAST_S = 30.0  # limit of the prediction interval, and so of the growth of the covariance
 ASSOCIATED_M = 0.1  # position sigma above which a robot is acquired again instead of associated
 ASSOCIATED_RAD = 0.15  # rotation sigma above which a constellation is: its markers may be exchanged
+START_M = 0.1  # standard deviation of `start_m`
+LOCAL_M = 0.3  # position sigma above which a history does not say where a robot is
 MAX_SHARD_MESSAGES = 1000  # of other shards, between two frame sets
 
 
@@ -83,6 +85,23 @@ class TrackTable:
         )
         rotated = (rotation2 > ASSOCIATED_RAD**2) & ~self.single
         return self.alive & ((position2 < ASSOCIATED_M**2) & ~rotated | self._seen)
+
+    def history_chi2(self, k: int, p: Array, covariance: Array) -> float:
+        """Squared Mahalanobis distance of p from robot k's last position, or from its start if never acquired."""
+        position, own = self.states.p[k], self.states.P[k, POSITION, POSITION]
+        if self.status[k] is None:
+            start = self.robots[k].start_m
+            if start is None:
+                return 0.0
+            position, own = np.array(start), START_M**2 * np.eye(3)
+        error = p - position
+        return float(error @ np.linalg.solve(own + covariance, error))
+
+    def is_local(self, k: int) -> bool:
+        """Whether its start or its history says where robot k is."""
+        if self.status[k] is None:
+            return self.robots[k].start_m is not None
+        return bool(np.trace(self.states.P[k, POSITION, POSITION]) < 3 * LOCAL_M**2)
 
     def observe(self, t_ns: int, assignments: Assignments) -> None:
         """Update the status: tracked while detected, coasting for a while without detections, then lost."""

@@ -34,7 +34,6 @@ from fusion.tracking.gating import (
 )
 from fusion.tracking.identification import RefinedFits
 from fusion.tracking.rays import Marker
-from fusion.tracking.single_markers import history_chi2, is_local
 from fusion.tracking.track_table import TrackTable
 
 MIN_FACING, MARGIN_PX = 0.35, 30.0  # of markers that a camera is certain to see
@@ -175,9 +174,9 @@ def refine(
     d2 = observations.misfit(residuals)
     rows = starts.robot.tolist()
     history = np.array(
-        [history_chi2(table, k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]
+        [table.history_chi2(k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]
     )
-    is_expected = (history < POSITION_GATE) & np.array([is_local(table, k) for k in rows], bool)
+    is_expected = (history < POSITION_GATE) & np.array([table.is_local(k) for k in rows], bool)
     return RefinedFits(
         starts.robot,
         states,

@@ -28,7 +28,7 @@ from fusion.tracking.gating import (
     START_SIGMAS_SINGLE,
 )
 from fusion.tracking.normals import start_rotation
-from fusion.tracking.rays import Marker
+from fusion.tracking.rays import Marker, MarkerHistories
 
 MOVED_M = 0.05  # since the anchor: far above the noise
 CONCLUSIVE_M = (
@@ -169,20 +169,6 @@ class UnlabeledMarkers:
         names = "position", "covariance", "velocity", "normal", "candidates"
         columns = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
         return UnlabeledMarkers((*self.markers, *other.markers), **columns)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkerHistories:
-    """What N markers did before: for how long they were tracked, seconds (N,), and how they moved (N,).
-
-    A marker in company moved together with another one: they belong to one body. A lone one moved since the last
-    anchor, and none moved with it. The motions of anchored markers are compared (N,).
-    """
-
-    age_s: Array
-    anchored: Mask
-    moves_with_others: Mask
-    alone: Mask
 
 
 @dataclass(frozen=True, slots=True, eq=False)

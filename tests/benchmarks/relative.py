@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 from camera_node.detection.detector import Detector
-from camera_node.detection.relative import DiscLocalizer
+from camera_node.detection.relative_positions import DiscLocalizer
 from camera_node.detection.roundels import LocatedRoundels
 from camera_node.geometry.lens import Lens
 from formation.live_formation import FormationScore

@@ -7,7 +7,7 @@ A command takes effect one frame after the exposure on which it is based. That i
 from collections.abc import Iterator
 
 from camera_node.detection.detector import Detector
-from camera_node.detection.relative import DiscLocalizer
+from camera_node.detection.relative_positions import DiscLocalizer
 from camera_node.protocol.messages import RelativePositions, decode, encode
 from formation.formation_control import Controller
 from formation.formation_robots import CAMERA, FPS, ROUNDEL, RobotCamera, RobotWorld, paint_background

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from camera_node.commands.camera import JoinArena
+from camera_node.commands.camera_command import JoinArena
 from camera_node.foundation.config import load_yaml
 from tests.conftest import ROOT, free_port
 from tests.security.lab import KEYS, Lab

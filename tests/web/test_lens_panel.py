@@ -18,7 +18,7 @@ from tests.web.browser import browsing, showing
 from web.state.subscription import Subscription
 from web.tabs.calibration_panels import CalibrationFiles
 from web.tabs.camera_tab import CameraSettings
-from web.tabs.lens import describe_lens
+from web.tabs.lens_panel import describe_lens
 from web.view import View
 
 N_VIEWS = 12  # that differ

@@ -34,7 +34,7 @@ DEMO = Command(
 VIEW = Command(
     "view",
     "show an arena or a recording in the browser",
-    "web.roundel.view:ViewArena",
+    "web.roundel.serve_page:ViewArena",
     ("roundel view --connect tcp/localhost:7447", "roundel view --replay recording.mcap"),
     "Arena",
     logging.WARNING,

@@ -26,7 +26,7 @@ from web.state.feed import ArenaState
 from web.state.subscription import REQUEST_TIMEOUT_S, Subscription
 from web.tables import STALE_S, tabulate_cameras
 from web.tabs.calibration_panels import CalibrationFiles
-from web.tabs.lens import LensPanel
+from web.tabs.lens_panel import LensPanel
 from web.tabs.mask_editor import MaskEditor
 from web.widgets import ActionButton, Answer, set_content, set_property
 

@@ -15,7 +15,7 @@ from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.labels import label_recording
 from calib.wand.quality.grade import assess
-from calib.wand.recalibration import recalibrate_camera
+from calib.wand.single_camera import recalibrate_camera
 from calib.wand.spacing import MAX_ROUNDELS
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.body import Body

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import tyro
 
-from camera_node.commands.camera import JoinArena
 from camera_node.commands.camera_check import check_camera
+from camera_node.commands.camera_command import JoinArena
 from camera_node.foundation.errors import ConfigError
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.rendering import Disc, render

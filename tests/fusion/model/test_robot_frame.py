@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.server_connection import Connection
-from fusion.commands.robots import robots
+from fusion.commands.edit_robots import robots
 from fusion.errors import FusionError
 from fusion.model.robots import DECIMALS, MAX_PIVOT_M, load_robots, move_origin, turn_heading
 from tests.conftest import ROOT

@@ -18,7 +18,7 @@ from tests.waiting import wait_for
 from tests.web.arena import ArenaMessages, four_cameras
 from tests.web.browser import loopback
 from web.errors import WebError
-from web.roundel.view import ViewArena
+from web.roundel.serve_page import ViewArena
 from web.state.feed import Feed
 from web.state.recording_player import RecordingPlayer
 from web.tables import tabulate_robots

@@ -21,7 +21,7 @@ from calib.wand.bundle_adjustment.covariance import (
 )
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
-from calib.wand.recalibration import recalibrate_camera
+from calib.wand.single_camera import recalibrate_camera
 from calib.wand.wand_report import WandCalibration
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, SHEET, camera_errors, joint_error, roughly

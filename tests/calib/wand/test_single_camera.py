@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
-from calib.wand.recalibration import recalibrate_camera
+from calib.wand.single_camera import recalibrate_camera
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, roughly
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from camera_node.foundation.errors import ConfigError
 
 if TYPE_CHECKING:
-    from camera_node.detection.relative import DiscLocalizer
+    from camera_node.detection.relative_positions import DiscLocalizer
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class RelativeSettings:
         self.check()
         if self.rig is None or self.diameter is None:
             return None
-        from camera_node.detection.relative import DiscLocalizer
+        from camera_node.detection.relative_positions import DiscLocalizer
         from camera_node.geometry.lens import load_lens
 
         return DiscLocalizer(load_lens(self.rig, name), self.diameter)

@@ -8,22 +8,25 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import tyro
+from rich.table import Table
 
 from camera_node.commands.camera_check import check_cameras
-from camera_node.commands.camera_list import list_cameras
-from camera_node.commands.relative import RelativeSettings
+from camera_node.commands.relative_settings import RelativeSettings
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import CameraAbsentError, ConfigError
 from camera_node.foundation.service import ServiceManager, stopped_by_signals
 from camera_node.foundation.supervisor import Supervisor
-from camera_node.foundation.terminal import say
+from camera_node.foundation.terminal import console, progress_console, say
 from camera_node.protocol.server_connection import FoundArena, choose_arena, find_arenas
-from camera_node.sources.drivers import local_cameras
+from camera_node.sources.camera_description import CameraDescription, Mode
+from camera_node.sources.drivers import all_cameras, local_cameras
 from camera_node.sources.frame import SourceSettings, without_credentials
 
 TICK_S = 0.25
 MAX_CHECK_S = 3600.0
+SHOWN_SIZES = 4  # of one camera in the table of --list
 LOOK_S = 3.0  # between looks for cameras that were plugged in
 
 
@@ -190,3 +193,43 @@ class LocalCameras:
             self._code = code
         else:
             say(f"{name}: ended")
+
+
+def list_cameras(as_json: bool) -> int:
+    """Print all cameras with their modes, as a table or as JSON with all controls; 1 if there is none."""
+    cameras, absent = all_cameras()
+    if as_json:
+        say(msgspec.json.format(msgspec.json.encode(cameras)).decode())
+        return 0 if cameras else 1
+    if cameras:
+        console().print(_table(cameras))
+    for fault in absent:
+        say(f"not searched: {fault}", progress_console() if cameras else None)
+    if not cameras:
+        say(
+            "no camera found; check power and cables. Network streams are not searched: give --source rtsp://..."
+        )
+    return 0 if cameras else 1
+
+
+def _table(cameras: list[CameraDescription]) -> Table:
+    table = Table("--source", "camera", "serial", "modes", "controls", "note")
+    for camera in cameras:
+        controls = str(len(camera.controls)) if camera.controls else ""
+        table.add_row(
+            camera.source, camera.name, camera.serial, _summary(camera.modes), controls, camera.note
+        )
+    return table
+
+
+def _summary(modes: tuple[Mode, ...]) -> str:
+    """The largest sizes, each with its pixel formats and its greatest rate."""
+    sizes = sorted({(mode.width, mode.height) for mode in modes}, reverse=True)
+    lines = []
+    for width, height in sizes[:SHOWN_SIZES]:
+        same = [mode for mode in modes if (mode.width, mode.height) == (width, height)]
+        rate = max((mode.max_fps or 0.0 for mode in same), default=0.0)
+        pixels = ", ".join(dict.fromkeys(mode.pixels.strip() for mode in same))
+        lines.append(f"{width} x {height}{f' {rate:.0f} Hz' if rate else ''} ({pixels})")
+    more = [f"and {len(sizes) - SHOWN_SIZES} smaller sizes"] if len(sizes) > SHOWN_SIZES else []
+    return "\n".join(lines + more)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from camera_node.detection.detector import Detector
-from camera_node.detection.relative import MAX_LOCATED, DiscLocalizer
+from camera_node.detection.relative_positions import MAX_LOCATED, DiscLocalizer
 from camera_node.detection.roundels import DetectedRoundels, LocatedRoundels
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
