@@ -67,10 +67,11 @@ class SecondRun:
         """Count a test as unstable, and no more as failed, or as passed before its fixtures failed."""
         self._collect(name, reports[0])
         terminal = session.config.pluginmanager.get_plugin("terminalreporter")
-        for category in ("failed", "error", "passed") if terminal else ():
-            kept = [report for report in terminal.stats.pop(category, []) if _name(report.nodeid) != name]
+        stats = terminal.stats if terminal else {}
+        for category in ("failed", "error", "passed"):
+            kept = [report for report in stats.pop(category, []) if _name(report.nodeid) != name]
             if kept:
-                terminal.stats[category] = kept
+                stats[category] = kept
         session.testsfailed -= len(reports)
         self.unstable.append(name)
         passed = pytest.TestReport(name, reports[0].location, {}, "passed", None, "call")
