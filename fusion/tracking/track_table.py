@@ -175,6 +175,7 @@ class TrackTable:
             self._seen_ns[at[new]] = message.t_ns
             for k in new.tolist():
                 self.status[at[k]] = message.states[k]
+                self._seen[at[k]] = message.states[k] == "tracked"
 
     def _stop(self, rows: list[int]) -> None:
         """Set the velocities of robots to zero."""
