@@ -101,10 +101,17 @@ class Series:
 
 
 class Queue:
-    """The loop of a server on the messages of a load; `free_ns` is when it has processed them."""
+    """The loop of a server on the messages of a load; `free_ns` is when it has processed them.
 
-    def __init__(self, load: Load, seconds: float, shard: Shard = Shard()) -> None:  # noqa: B008 frozen
-        self.load = load
+    Args:
+        load: robots and cameras.
+        seconds: of the load.
+        shard: the robots of this server.
+        pace: factor of the measured processor times, to simulate a faster or a slower machine.
+    """
+
+    def __init__(self, load: Load, seconds: float, shard: Shard = Shard(), pace: float = 1.0) -> None:  # noqa: B008 frozen
+        self.load, self.pace = load, pace
         self.tracker = Tracker(load.rig, load.bodies, shard=shard)
         self.synchronizer = FrameSynchronizer(round(1e9 / load.hz))
         self.free_ns = self.busy_ns = self._first_ns = self._collected_ns = 0
@@ -190,7 +197,7 @@ class Queue:
         begun = time.process_time_ns()
         done = work()
         cost = time.process_time_ns() - begun
-        self.free_ns += cost
+        self.free_ns += round(cost * self.pace)
         self.busy_ns += cost
         return done
 

@@ -96,7 +96,8 @@ def test_a_camera_at_ten_times_the_rate_is_thinned_and_reported(tmp_path: Path):
         assert f"camera cam3: {ABOVE_QUOTA}" in server.log.read_text()
 
 
-@pytest.mark.parametrize("n", [4096, pytest.param(600, marks=pytest.mark.slow)])
+@pytest.mark.slow  # needs a machine that can serve it at 30 Hz; tracking/test_false_roundels.py has no such need
+@pytest.mark.parametrize("n", [4096, 600])
 def test_false_roundels_do_not_delay_poses(tmp_path: Path, n: int):
     """Before: 1.1 s with 600 in two cameras; a frame with more than that was searched by none."""
     with arena(tmp_path, range(2)) as (server, observer):
