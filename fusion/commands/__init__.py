@@ -68,7 +68,7 @@ COMMANDS = (
         "Robots",
         "robots",
         "list, rename, remove and save the robots of the running server",
-        "robots:robots",
+        "edit_robots:robots",
         "roundel robots list",
         "roundel robots rename robot-1 rover",
         "roundel robots save robots.yaml",
