@@ -54,7 +54,7 @@ setup: .venv/ready
 # Without build isolation, so that this build and the wheel's test compile changed files only.
 .venv/ready: constraints.txt pyproject.toml CMakeLists.txt $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
-	  echo "error: $(PYTHON) is older than Python 3.11; run make with PYTHON=/path/to/python3.11" >&2; exit 2; }
+	  echo "error: $(PYTHON) does not run, or is older than Python 3.11; run make with PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@$(PYTHON) -m venv .venv
 	@echo "setting up .venv (a few minutes the first time)"
 	@$(BUILD_REQUIRES) | $(call PIP,.venv) -c constraints.txt -r /dev/stdin
