@@ -38,7 +38,7 @@ types: .venv/ready
 # The workflows' checker: its wheel would download a program that no registry has. Without access to Go's modules it is missed.
 build/bin/actionlint:
 	@mkdir -p $(@D)
-	@GOBIN=$(CURDIR)/$(@D) go install github.com/rhysd/actionlint/cmd/actionlint@v1.7.12 2>/dev/null || true
+	@GOBIN=$(CURDIR)/$(@D) timeout 300 go install github.com/rhysd/actionlint/cmd/actionlint@v1.7.12 2>/dev/null || true
 
 docs: .venv/ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -157,7 +157,7 @@ def write_rosbag(poses: RecordedPoses, path: Path) -> None:
 
 
 def write_foxglove(poses: RecordedPoses, path: Path) -> None:
-    """Write an MCAP file with the topics of `fusion foxglove`, except images and unlabeled markers.
+    """Write an MCAP file with the topics of `roundel foxglove`, except images and unlabeled markers.
 
     Raises:
         ConfigError: foxglove-sdk is missing.
