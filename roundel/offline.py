@@ -185,7 +185,7 @@ def track(
             print(pose.t_ns, pose.robot, pose.position)
 
     Without `rig` and `rate_hz`, the poses of a recorded server are repeated exactly, and its detections are held in
-    memory. Otherwise frame sets are formed anew from the times of arrival, one after the other. What is skipped is
+    memory. Otherwise frame sets are formed from the times of arrival, one after the other. What is skipped is
     logged as a warning at the end.
 
     Args:
@@ -202,7 +202,7 @@ def track(
     Raises:
         ConfigError: a file is missing or broken, or the recording has no rig or no robots and none are given.
         CalibrationError: no camera has a pose.
-        FusionError: the robots can't be told from each other.
+        FusionError: the robots can't be distinguished.
     """
     recording = recording if isinstance(recording, Recording) else Recording(recording)
     placed, declared = _cameras_of(recording, rig), _robots_of(recording, robots)

@@ -67,7 +67,7 @@ COLUMNS = {
 
 
 class Recording:
-    """A recording of an arena. Iterators read the file anew and hold one message at a time.
+    """A recording of an arena. Iterators read the file again each time and hold one message at a time.
 
         recording = Recording("lab.mcap")
         for pose in recording.poses("rover"):
@@ -125,7 +125,7 @@ class Recording:
         start_s: float | None = None,
         end_s: float | None = None,
     ) -> Iterator[RobotPose]:
-        """Yield the poses that the server published. Only an MCAP file has some; `track` estimates them anew.
+        """Yield the poses that the server published. Only an MCAP file has some; `track` estimates them again.
 
         Args:
             robots: a robot, or several; all unless given.

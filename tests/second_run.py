@@ -69,9 +69,9 @@ class SecondRun:
         terminal = session.config.pluginmanager.get_plugin("terminalreporter")
         stats = terminal.stats if terminal else {}
         for category in ("failed", "error", "passed"):
-            kept = [report for report in stats.pop(category, []) if _name(report.nodeid) != name]
-            if kept:
-                stats[category] = kept
+            remaining = [report for report in stats.pop(category, []) if _name(report.nodeid) != name]
+            if remaining:
+                stats[category] = remaining
         session.testsfailed -= len(reports)
         self.unstable.append(name)
         passed = pytest.TestReport(name, reports[0].location, {}, "passed", None, "call")

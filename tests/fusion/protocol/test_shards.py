@@ -78,6 +78,25 @@ def test_crossing_robots_of_different_shards_keep_their_detections():
     assert n_shared > 20
 
 
+def test_the_other_shards_robots_have_their_detections_at_ten_frame_sets_a_second():
+    """Between two frame sets a prediction becomes uncertain; the other shard's robots are tracked nevertheless, so a
+    single marker beside them has no rival."""
+    mine, other = (next(name for name in NAMES if Shard(k, 2).owns(name)) for k in (1, 2))
+    single = [name for name in NAMES if Shard(2, 2).owns(name)][1]
+    motions = {mine: line((-0.3, 0.1, 0.2)), other: line((0.3, -0.1, 0.2)), single: line((0.0, 0.4, 0.2))}
+    robots = {mine: TRIANGLE, other: WIDE, single: Robot(diameter_m=0.12)}
+    arena = Arena(robots, motions, sigma_px=0.05)
+    trackers = [Tracker(arena.cameras, robots, shard=Shard(k, 2)) for k in (1, 2)]
+    poses: list[RobotPose] = []
+    for frame_set in synchronize(arena.frames(60))[::3]:
+        fused = [tracker.track(frame_set) for tracker in trackers]
+        poses = [pose for one in fused for pose in one.poses]
+        for tracker, other_tracker in zip(trackers, trackers[::-1], strict=True):
+            other_tracker.table.receive(decode(encode(tracker.table.shard_poses()), ShardPoses))
+    assert {pose.robot for pose in poses if pose.state == "tracked"} == set(robots)
+    assert np.abs(errors(arena, poses)[:, 3:]).max() < 5e-3
+
+
 def synchronize(frames: list[CalibratedFrame]) -> list[FrameSet]:
     """All frame sets of a run, in order."""
     synchronizer = FrameSynchronizer(PERIOD_NS)
