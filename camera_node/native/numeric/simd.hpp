@@ -10,7 +10,7 @@
 /// so that every machine, with or without vectors, computes the same result to the last bit.
 #if defined(__x86_64__) && defined(__linux__) && !defined(ROUNDEL_SCALAR)
 #define ROUNDEL_CLONES __attribute__((target_clones("arch=x86-64-v3", "default")))
-#define ROUNDEL_AVX2 __attribute__((target("arch=x86-64-v3")))
+#define ROUNDEL_AVX2 __attribute__((target("avx2")))
 #define ROUNDEL_BASELINE __attribute__((target("default")))
 #else
 #define ROUNDEL_CLONES

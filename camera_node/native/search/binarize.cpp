@@ -147,6 +147,9 @@ ROUNDEL_AVX2 inline BlockBits binarize_block_by_32(const uint8_t* a, const uint8
     return bits;
 }
 
+#if defined(__clang__)  // clang 14 calls the variant of a dispatched function unused
+#pragma clang diagnostic ignored "-Wunused-function"
+#endif
 ROUNDEL_AVX2 void binarize_rows(const uint8_t* a, const uint8_t* b, const RowThreshold& theta, int first,
                                 int blocks, RowBits to) {
     for (int n = 0; n < blocks; ++n, a += kBlock, b += kBlock) {
