@@ -6,24 +6,23 @@ messages of an arena's recording are defined by fusion (`fusion.recordings.arena
 """
 
 import io
+import logging
 import os
-import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import cast
 
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
 from mcap.writer import IndexType, Writer
 
 from calib.rig.camera import Camera
 from calib.rig.file_history import History
+from calib.rig.recording_reader import PROFILE, ReadLimits, RecordingReader
 from calib.rig.recording_repair import repair_recording
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
-MAGIC = 8  # bytes at the start of every MCAP file
+LOG = logging.getLogger("calib")
 MIN_CHUNK, MAX_CHUNK = 1 << 16, 1 << 20  # bytes compressed together: the most that a cut-off loses
 MAX_LOST = 1 / 64  # of the file, between these: the writer remembers each chunk
 
@@ -59,7 +58,7 @@ class RecordingWriter:
             raise ConfigError(f"{self.path} can't be written: {error.strerror}; check its folder") from None
         # An index of each channel in each chunk would take up to 0.1 kB of memory for each of them until the end.
         self._writer = Writer(self._file, chunk_size=MAX_CHUNK, index_types=IndexType.CHUNK)
-        self._writer.start(profile="roundel", library="roundel")
+        self._writer.start(profile=PROFILE, library="roundel")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -108,28 +107,33 @@ class RecordingWriter:
         return ConfigError(f"{self.path}: {error.strerror}: {state}")
 
 
-def read_messages(path: Path, faults: Counter[str] | None = None) -> Iterator[tuple[str, bytes, int]]:
+def read_messages(
+    path: Path, faults: Counter[str] | None = None, limits: ReadLimits | None = None
+) -> Iterator[tuple[str, bytes, int]]:
     """Yield key, bytes and time of arrival (ns) of each message, in the order of arrival.
+
+    Damaged parts are skipped, as are chunks and messages that state more than the limits.
 
     Args:
         path: the MCAP file.
-        faults: counts a recording that was cut off; without it, such a recording raises.
+        faults: is given what was skipped, at the end; without it, a recording that is not whole raises there.
+        limits: see `ReadLimits`.
 
     Raises:
         ConfigError: the file is missing, or not an MCAP file.
     """
     try:
         with path.open("rb") as file:
-            reader = NonSeekingReader(file)
+            reader = RecordingReader(file, limits or ReadLimits())
             try:
-                for _, channel, message in reader.iter_messages(log_time_order=False):
-                    yield channel.topic, message.data, message.log_time
-            except (McapError, EOFError, struct.error) as error:
-                if faults is None or file.tell() <= MAGIC:
-                    raise ConfigError(
-                        f"{path} is not an MCAP recording ({error}); give a file of roundel record"
-                    ) from None
-                faults["end: the recording was cut off"] += 1
+                for message in reader:
+                    yield message.key, message.data, message.t_ns
+            finally:
+                if faults is not None:
+                    faults |= reader.faults()  # the larger count: a file may be read several times
+            if faults is None and (found := reader.faults()):
+                reasons = "; ".join(f"{count} {reason}" for reason, count in found.items())
+                raise ConfigError(f"{path} is not whole: {reasons}")
     except OSError as error:
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
 
@@ -163,19 +167,21 @@ def save_wand_recording(path: Path, arena: str, messages: Iterable[Detections]) 
 
 
 def read_detections(path: Path) -> list[Detections]:
-    """Read the detections of a recording up to its end, even if it was cut off; invalid messages are skipped.
+    """Read the detections of a recording; what is skipped, as damaged parts and invalid messages, is logged.
 
     Raises:
         ConfigError: the file is missing, not an MCAP recording, or holds no detections.
     """
-    messages = []
-    for key, data, _ in read_messages(path, Counter()):
+    messages, faults = [], Counter[str]()
+    for key, data, _ in read_messages(path, faults):
         if not key.endswith("/detections"):
             continue
         try:
             messages.append(decode(data, Detections))
         except MessageError:
-            continue
+            faults["invalid detections"] += 1
+    for reason, count in faults.items():
+        LOG.warning("%s: skipped %d %s", path, count, reason)
     if not messages:
         raise ConfigError(f"{path} holds no detections; record with roundel record {path}")
     return messages

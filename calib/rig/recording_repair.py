@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Completes recordings that were cut off: writes the missing index behind the last complete chunk.
+"""Completes recordings that were cut off or damaged: marks what can't be read, and writes a new index.
 
-The format is described at https://mcap.dev/spec. A chunk holds messages and the channels that they need.
+A damaged part becomes a private record, which every MCAP reader skips. Its bytes stay in the file.
 """
 
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable
@@ -13,25 +12,13 @@ from pathlib import Path
 from typing import IO
 
 from mcap.data_stream import RecordBuilder
-from mcap.exceptions import McapError
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Message,
-    Schema,
-    Statistics,
-)
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex, DataEnd, Footer, Header, McapRecord, Statistics
 
+from calib.rig.recording_reader import MAGIC, PROFILE, RECORD, SET_ASIDE, Part, ReadLimits, RecordingReader
 from camera_node.foundation.errors import ConfigError
 
-MAGIC = b"\x89MCAP0\r\n"
-HEADER = Header(profile="roundel", library="roundel")
+HEADER = Header(profile=PROFILE, library="roundel")
 
 
 @dataclass(frozen=True)
@@ -42,19 +29,21 @@ class Repair:
         n_messages: messages in the recording.
         lost_bytes: bytes of the unfinished chunk that were removed.
         was_complete: there was nothing to repair.
+        faults: what can't be read any more, by reason, but for the end.
     """
 
     n_messages: int
     lost_bytes: int
     was_complete: bool
+    faults: Counter[str]
 
 
 @dataclass(frozen=True)
 class _IndexedChunk:
-    """A complete chunk: its entry in the index, the position behind it, and the messages of each channel."""
+    """A complete chunk: its entry in the index, its place in the file, and the messages of each channel."""
 
     index: ChunkIndex
-    end: int
+    part: Part
     counts: Counter[int]
 
 
@@ -62,92 +51,108 @@ class _IndexedChunk:
 class _Content:
     """The complete records of a recording."""
 
-    has_header: bool = False
-    has_footer: bool = False
-    start: int = len(MAGIC)  # of the first chunk
+    reader: RecordingReader
+    is_sound: bool = True
+    end: int = len(MAGIC)
+    damaged: list[Part] = field(default_factory=list)  # not marked yet
     chunks: list[_IndexedChunk] = field(default_factory=list)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    schemas: dict[int, Schema] = field(default_factory=dict)
-
-    @property
-    def end(self) -> int:
-        return self.chunks[-1].end if self.chunks else self.start
-
-    def counts(self) -> Counter[int]:
-        """Messages by channel."""
-        return sum((chunk.counts for chunk in self.chunks), Counter[int]())
+    counts: Counter[int] = field(default_factory=Counter)  # messages by channel
 
 
-def repair_recording(path: Path, max_size: int | None = None) -> Repair:
-    """Complete a recording in place: remove the unfinished chunk at its end, and write the index.
+def repair_recording(path: Path, max_size: int | None = None, limits: ReadLimits | None = None) -> Repair:
+    """Complete a recording in place: mark its damaged parts, remove the unfinished chunk at its end, write the index.
 
     Args:
         path: an MCAP file with chunks, as `RecordingWriter` writes it.
         max_size: of the file in bytes, where the disk is full: the last chunks give way to the index.
+        limits: what a chunk and a message may state.
 
     Raises:
-        ConfigError: the file is missing, is not an MCAP recording or can't be written.
+        ConfigError: the file is missing, is not an MCAP recording, exceeds the limits or can't be written.
     """
     try:
         with path.open("rb+") as file:
             size = file.seek(0, 2)
-            file.seek(0)
-            if file.read(len(MAGIC)) != MAGIC:
-                raise ConfigError(f"{path} is not an MCAP recording; give a file that roundel record wrote")
-            content = _read_content(file)
-            if not content.has_footer:
+            reader = RecordingReader(file, limits or ReadLimits())
+            content = _read_content(file, reader)
+            if reader.n_too_large:
+                raise ConfigError(
+                    f"{path} is unchanged: it has {next(r for r in reader.faults() if r.startswith('chunks of'))}"
+                )
+            was_complete = content.is_sound
+            lost_bytes = size - content.end if reader.is_cut_off else 0
+            if not was_complete:
                 _write_index(file, content, max_size)
+            if content.damaged:  # a chunk of which only the length was wrong is readable now
+                reader = RecordingReader(file, reader.limits)
+                content = _read_content(file, reader)
+                if not content.is_sound:
+                    _write_index(file, content, max_size)
     except OSError as error:
         raise ConfigError(
             f"{path} can't be repaired: {error.strerror}; check the path and the disk"
         ) from None
-    lost_bytes = 0 if content.has_footer else size - content.end
-    return Repair(content.counts().total(), lost_bytes, content.has_footer)
+    faults = reader.faults()
+    faults.pop("end: the recording was cut off", None)
+    return Repair(content.counts.total(), lost_bytes, was_complete, faults)
 
 
-def _read_content(file: IO[bytes]) -> _Content:
-    """Read all complete records behind the magic. Damaged chunks are left out of the index."""
-    content, start = _Content(), len(MAGIC)
-    try:
-        for record in StreamReader(file, skip_magic=True, emit_chunks=True).records:
-            if isinstance(record, Header):
-                content.has_header, content.start = True, file.tell()
-            elif isinstance(record, Chunk):
-                _add_chunk(content, record, start, file.tell())
-            elif isinstance(record, Footer):
-                content.has_footer = file.read(len(MAGIC)) == MAGIC
-                break
-            start = file.tell()
-    except (McapError, ValueError, struct.error):  # the file ends inside a record
-        pass
+def _read_content(file: IO[bytes], reader: RecordingReader) -> _Content:
+    """Read all complete records behind the magic."""
+    content = _Content(reader, is_sound=reader.is_complete)
+    for part in reader.parts():
+        if part.records is None:
+            file.seek(part.start)
+            is_marked = file.read(RECORD.size) == _mark(part)
+            if not is_marked:
+                content.is_sound = False
+                content.damaged.append(part)
+        else:
+            times, counts = [], Counter[int]()
+            for message in reader.messages(part):
+                counts[message.channel] += 1
+                times = (
+                    [min(message.t_ns, *times), max(message.t_ns, *times)] if times else [message.t_ns] * 2
+                )
+            content.counts += counts
+            if part.chunk is not None:
+                content.is_sound &= part.opcode == Opcode.CHUNK
+                content.chunks.append(_IndexedChunk(_chunk_index(part, times), part, counts))
+        if part.opcode != Opcode.DATA_END:
+            content.end = part.end
     return content
 
 
-def _add_chunk(content: _Content, chunk: Chunk, start: int, end: int) -> None:
-    try:
-        records = breakup_chunk(chunk, validate_crc=True)
-    except Exception:  # whatever the decompressor raises: the chunk is damaged
-        return
-    index = ChunkIndex(
-        chunk_start_offset=start,
-        chunk_length=end - start,
-        message_start_time=chunk.message_start_time,
-        message_end_time=chunk.message_end_time,
+def _mark(part: Part) -> bytes:
+    """The start of the record that a part becomes: a chunk whose opcode was damaged, or one to skip."""
+    opcode = SET_ASIDE if part.records is None else Opcode.CHUNK
+    return RECORD.pack(opcode, part.end - part.start - RECORD.size)
+
+
+def _chunk_index(part: Part, times: list[int]) -> ChunkIndex:
+    compression, compressed_size, uncompressed_size = part.chunk or ("", 0, 0)
+    return ChunkIndex(
+        chunk_start_offset=part.start,
+        chunk_length=part.end - part.start,
+        message_start_time=times[0] if times else 0,
+        message_end_time=times[1] if times else 0,
         message_index_offsets={},  # valid: readers then search the whole chunk
         message_index_length=0,
-        compression=chunk.compression,
-        compressed_size=len(chunk.data),
-        uncompressed_size=chunk.uncompressed_size,
+        compression=compression,
+        compressed_size=compressed_size,
+        uncompressed_size=uncompressed_size,
     )
-    counts = Counter(record.channel_id for record in records if isinstance(record, Message))
-    content.chunks.append(_IndexedChunk(index, end, counts))
-    content.channels |= {record.id: record for record in records if isinstance(record, Channel)}
-    content.schemas |= {record.id: record for record in records if isinstance(record, Schema)}
 
 
 def _write_index(file: IO[bytes], content: _Content, max_size: int | None) -> None:
     while content.chunks and max_size is not None and content.end + len(_index(content)) > max_size:
-        content.chunks.pop()
+        removed = content.chunks.pop()
+        content.counts -= removed.counts
+        content.end = removed.part.start
+    for part in (*content.damaged, *(chunk.part for chunk in content.chunks)):
+        if part.start < content.end:
+            file.seek(part.start)
+            file.write(_mark(part))
     file.seek(content.end)
     file.write(_index(content))
     file.truncate()
@@ -156,11 +161,15 @@ def _write_index(file: IO[bytes], content: _Content, max_size: int | None) -> No
 
 def _index(content: _Content) -> bytes:
     """The bytes behind the last chunk: the end of the data, the summary and the footer."""
-    data_end = _encode([] if content.has_header else [HEADER], [DataEnd(data_section_crc=0)])
+    reader = content.reader
+    data_end = _encode([] if reader.has_header else [HEADER], [DataEnd(data_section_crc=0)])
     chunks = [chunk.index for chunk in content.chunks]
-    summary = _encode(
-        content.schemas.values(), content.channels.values(), [_statistics(content)] if chunks else [], chunks
-    )
+    definitions = [
+        RECORD.pack(opcode, len(record)) + record
+        for opcode, known in ((Opcode.SCHEMA, reader.schemas), (Opcode.CHANNEL, reader.channels))
+        for record in known.values()
+    ]
+    summary = b"".join(definitions) + _encode([_statistics(content)] if chunks else [], chunks)
     start = content.end + len(data_end) if summary else 0
     # the checksum covers the summary and the footer up to the checksum itself
     unsigned = _encode([Footer(summary_start=start, summary_offset_start=0, summary_crc=0)])
@@ -170,17 +179,21 @@ def _index(content: _Content) -> bytes:
 
 
 def _statistics(content: _Content) -> Statistics:
-    counts = content.counts()
+    times = [chunk.index for chunk in content.chunks if chunk.counts]
+    starts, ends = [i.message_start_time for i in times], [i.message_end_time for i in times]
+    if content.reader.statistics is not None:  # the recorder's: they include damaged parts at both ends
+        starts.append(content.reader.statistics.start_ns)
+        ends.append(content.reader.statistics.end_ns)
     return Statistics(
-        message_count=counts.total(),
-        schema_count=len(content.schemas),
-        channel_count=len(content.channels),
+        message_count=content.counts.total(),
+        schema_count=len(content.reader.schemas),
+        channel_count=len(content.reader.channels),
         attachment_count=0,
         metadata_count=0,
         chunk_count=len(content.chunks),
-        message_start_time=min(chunk.index.message_start_time for chunk in content.chunks),
-        message_end_time=max(chunk.index.message_end_time for chunk in content.chunks),
-        channel_message_counts=dict(counts),
+        message_start_time=min(starts, default=0),
+        message_end_time=max(ends, default=0),
+        channel_message_counts=dict(content.counts),
     )
 
 

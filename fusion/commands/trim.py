@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`roundel trim`: a part of a recording as a recording."""
 
+from collections import Counter
 from pathlib import Path
 
 from camera_node.foundation.terminal import say
-from fusion.recordings.recording_files import trim_recording
+from fusion.recordings.recording_files import say_skipped, trim_recording
 
 
 def trim(recording: Path, out: Path, /, *, from_s: float = 0.0, to_s: float = 1e9) -> int:
@@ -16,6 +17,8 @@ def trim(recording: Path, out: Path, /, *, from_s: float = 0.0, to_s: float = 1e
         from_s: start of the part, seconds after the first message.
         to_s: end of the part, seconds after the first message.
     """
-    count = trim_recording(recording, out, from_s, to_s)
+    faults = Counter[str]()
+    count = trim_recording(recording, out, from_s, to_s, faults)
+    say_skipped(faults)
     say(f"wrote {out}: {count} messages")
     return 0

@@ -7,12 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-
 from calib.rig.recording import RecordingWriter, read_messages
+from calib.rig.recording_reader import RecordingReader
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.terminal import say
 
 KEY = re.compile(r".+?/(camera|robot)/([^/]+)/(?:detections|pose)")
 MAX_FILES = 200  # of one folder, the newest
@@ -42,15 +41,14 @@ def summarize_recording(path: Path) -> RecordingSummary:
     size = path.stat().st_size
     try:
         with path.open("rb") as file:
-            summary = make_reader(file).get_summary()
-    except (McapError, ValueError, EOFError, OSError):  # OSError: its end is sought before its beginning
-        summary = None
-    if summary is None or summary.statistics is None:
+            reader = RecordingReader(file)
+    except ConfigError:
         return RecordingSummary(path, size)
-    statistics = summary.statistics
-    named = [found for channel in summary.channels.values() if (found := KEY.fullmatch(channel.topic))]
+    if reader.statistics is None:
+        return RecordingSummary(path, size)
+    named = [found for key in reader.keys.values() if (found := KEY.fullmatch(key))]
     names = {kind: tuple(sorted({m[2] for m in named if m[1] == kind})) for kind in ("camera", "robot")}
-    seconds = (statistics.message_end_time - statistics.message_start_time) / 1e9
+    seconds = (reader.statistics.end_ns - reader.statistics.start_ns) / 1e9
     return RecordingSummary(path, size, seconds, names["camera"], names["robot"])
 
 
@@ -116,9 +114,17 @@ CONTEXT = (
 )  # ends of keys whose latest message before the part still holds in it
 
 
-def trim_recording(recording: Path, out: Path, from_s: float, to_s: float) -> int:
+def say_skipped(faults: Counter[str]) -> None:
+    """Print what of a recording was skipped, one line a reason."""
+    for reason, count in sorted(faults.items()):
+        say(f"skipped: {count} {reason}")
+
+
+def trim_recording(
+    recording: Path, out: Path, from_s: float, to_s: float, faults: Counter[str] | None = None
+) -> int:
     """Write the messages that arrived from `from_s` to `to_s` after the first one, and what held at `from_s`: the
-    rig, the robots and the states of the cameras and the server.
+    rig, the robots and the states of the cameras and the server. `faults` counts what could not be read.
 
     Returns:
         the number of messages in the part.
@@ -128,7 +134,7 @@ def trim_recording(recording: Path, out: Path, from_s: float, to_s: float) -> in
     """
     if not 0 <= from_s < to_s:
         raise ConfigError(f"a part from {from_s:g} s to {to_s:g} s is empty; give --from-s below --to-s")
-    faults: Counter[str] = Counter()
+    faults = Counter[str]() if faults is None else faults
     start_ns = min((t_ns for *_, t_ns in read_messages(recording, faults)), default=0)
     begin_ns, end_ns = (start_ns + round(s * 1e9) for s in (from_s, min(to_s, 1e9)))
     context: dict[str, bytes] = {}

@@ -214,11 +214,11 @@ class Feed:
                 started_s=old.started_s, server_alive=old.server_alive, faults=old.faults
             )
 
-    def count_fault(self, reason: str) -> None:
-        """Count a message or drawing that was skipped."""
+    def count_fault(self, reason: str, count: int = 1) -> None:
+        """Count messages or drawings that were skipped."""
         with self._lock:
             faults = self._state.faults
-            faults[reason if reason in faults or len(faults) < MAX_REASONS else "others"] += 1
+            faults[reason if reason in faults or len(faults) < MAX_REASONS else "others"] += count
 
     def _store_as(self, name: str) -> Callable[[msgspec.Struct, str], None]:
         return lambda message, key: setattr(self._state, name, TimedMessage(message, self._received_s))

@@ -114,8 +114,7 @@ class RecordingPlayer:
         """Play into a feed until `stop` is set; with `once`, set it at the end of the recording."""
         feed.set_server_alive(True)
         for reason, count in self.faults.items():
-            for _ in range(count):
-                feed.count_fault(reason)
+            feed.count_fault(reason, count)
         playback = self._start_pass(feed)
         while not stop.wait(STEP_S):
             with self._lock:

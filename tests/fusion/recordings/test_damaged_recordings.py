@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Damage costs a recording the chunk that it is in, every reader says what is missing, and no file takes all memory."""
+
+import random
+import struct
+import subprocess
+import sys
+import zlib
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.reader import NonSeekingReader, make_reader
+
+from calib.rig.recording import RecordingWriter, read_messages
+from calib.rig.recording_reader import MAGIC, RecordingReader
+from calib.rig.recording_repair import repair_recording
+from camera_node.foundation.errors import ConfigError
+from tests.conftest import ROOT
+from tests.processes import run_program
+
+pytestmark = pytest.mark.computed
+SAMPLE = ROOT / "docs" / "sample.mcap"
+N_SAMPLE = 1502  # messages
+Entry = tuple[str, bytes, int]
+
+
+def write(path: Path, n: int = 210, size: int = 1000) -> list[Entry]:
+    noise = random.Random(1)
+    entries = [(f"arena/camera/c{k % 3}/detections", noise.randbytes(size), 10**9 * k) for k in range(n)]
+    with RecordingWriter(path) as writer:
+        for entry in entries:
+            writer.put(*entry)
+    return entries
+
+
+def chunk_starts(path: Path) -> list[int]:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+
+
+def read(path: Path) -> tuple[list[Entry], RecordingReader]:
+    with path.open("rb") as file:
+        reader = RecordingReader(file)
+        return [(m.key, m.data, m.t_ns) for m in reader], reader
+
+
+def damaged_sample(folder: Path, at: int = 6) -> Path:
+    """The sample with a wrong byte in the middle of one of its chunks."""
+    path = folder / "damaged.mcap"
+    data = bytearray(SAMPLE.read_bytes())
+    start = chunk_starts(SAMPLE)[at]
+    data[start + 2000] ^= 0x10
+    path.write_bytes(data)
+    return path
+
+
+def test_a_wrong_byte_anywhere_costs_one_chunk_and_is_reported(tmp_path: Path):
+    """At every byte of the records' headers, and at random elsewhere: a message that is not read is counted, and its
+    time is. A repair makes the file readable for other readers, too, and says the same."""
+    path, wrong = tmp_path / "a.mcap", tmp_path / "wrong.mcap"
+    entries = write(path)
+    whole, starts = path.read_bytes(), chunk_starts(path)
+    assert len(starts) == 4
+    noise = random.Random(2)
+    headers = {start + k for start in (len(MAGIC), *starts) for k in range(56)}
+    elsewhere = {noise.randrange(len(MAGIC), len(whole)) for _ in range(200)}
+    tail = set(range(len(whole) - 45, len(whole)))
+    for at in sorted(headers | elsewhere | tail):
+        data = bytearray(whole)
+        data[at] ^= 1 << noise.randrange(8)
+        wrong.write_bytes(data)
+        found, reader = read(wrong)
+        assert set(found) <= set(entries)
+        assert found == sorted(found, key=lambda entry: entry[2])
+        n_missing = len(entries) - len(found)
+        assert n_missing <= 70, at
+        if reader.has_header and reader.n_damaged:  # at the end only an intact index knows how many
+            assert reader.n_missing == n_missing or not reader.is_complete, at
+            assert abs(reader.missing_s - n_missing) <= 1, at
+        assert (n_missing == 0) or reader.faults(), at
+        n_found = len(found)
+        repair = repair_recording(wrong)
+        found, repaired = read(wrong)  # a chunk of which only the length was wrong is readable again
+        assert repair.n_messages == len(found) >= n_found, at
+        assert repair_recording(wrong).was_complete, at
+        # The first chunk has the channels, which a reader without the index can't do without.
+        for kind in (make_reader, NonSeekingReader) if entries[0] in found else (make_reader,):
+            with wrong.open("rb") as file:
+                assert [m.log_time for _, _, m in kind(file).iter_messages()] == [e[2] for e in found], at
+        if len(found) == n_found:
+            assert (repaired.n_damaged, repaired.missing_s) == (reader.n_damaged, reader.missing_s), at
+
+
+def test_a_damaged_recording_of_an_arena_is_used_and_described(tmp_path: Path):
+    """Each command goes on, and says how many messages and seconds are missing."""
+    path = damaged_sample(tmp_path)
+    found, reader = read(path)
+    n, seconds = N_SAMPLE - len(found), f"{reader.missing_s:.2f} s"
+    assert 0 < n < 120
+    assert 0.3 < reader.missing_s < 0.6  # of eight seconds in 18 chunks
+    said = f"{n} messages in 1 damaged part of the recording, {seconds} in all"
+    commands = [
+        ["fusion", "replay", path, "--out", tmp_path / "poses.csv"],
+        ["fusion", "trim", path, tmp_path / "part.mcap"],
+        ["fusion", "export", path, tmp_path / "part.csv"],
+        ["fusion", "repair", path, "--out", tmp_path / "repaired.mcap"],
+        ["fusion", "repair", tmp_path / "repaired.mcap"],
+        ["fusion", "replay", tmp_path / "repaired.mcap", "--out", tmp_path / "again.mcap"],
+    ]
+    for words in commands:
+        done = run_program(*words)
+        assert done.returncode == 0, (words, done.stderr)
+        assert "Traceback" not in done.stderr
+        assert said in done.stdout + done.stderr, (words, done.stdout, done.stderr)
+    assert (
+        f"is complete: {len(found)} messages"
+        in run_program("fusion", "repair", tmp_path / "part.mcap").stdout
+    )
+
+
+def test_a_strict_reader_refuses_a_damaged_recording(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"is not whole: .* messages in 1 damaged part"):
+        list(read_messages(damaged_sample(tmp_path)))
+
+
+def test_several_passes_count_damage_once(tmp_path: Path):
+    path, faults = damaged_sample(tmp_path), Counter[str]()
+    passes = [list(read_messages(path, faults)) for _ in range(3)]
+    assert faults == read(path)[1].faults()
+    assert passes[0] == passes[2]
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def text(word: str) -> bytes:
+    return struct.pack("<I", len(word)) + word.encode()
+
+
+def hostile(stated: int, records: bytes, check_sum: int | None = None) -> bytes:
+    """A file whose only chunk states a size."""
+    data = zstandard.compress(records)
+    check_sum = zlib.crc32(records) if check_sum is None else check_sum
+    chunk = struct.pack("<QQQI", 0, 1, stated, check_sum) + text("zstd") + struct.pack("<Q", len(data)) + data
+    return MAGIC + record(1, text("roundel") + text("roundel")) + record(6, chunk)
+
+
+def channel_and_message(size: int) -> bytes:
+    channel = (
+        struct.pack("<HH", 1, 0) + text("a/camera/c/detections") + text("msgpack") + struct.pack("<I", 0)
+    )
+    return record(4, channel) + record(5, struct.pack("<HIQQ", 1, 0, 5, 5) + bytes(size))
+
+
+READ_WITH_LITTLE = """
+import resource, sys
+from collections import Counter
+from pathlib import Path
+from calib.rig.recording import read_messages
+from calib.rig.recording_repair import repair_recording
+path, faults = Path(sys.argv[1]), Counter()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+n = sum(1 for _ in read_messages(path, faults))
+print(n, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, "|", *faults)
+"""
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (hostile(1 << 30, b"x" * (1 << 30)), "chunks of more than"),  # 1 GB in 33 kB
+        (hostile(1 << 32, b"x" * (1 << 30)), "cut off"),  # states 4 GB, and its frame 1 GB
+        (hostile(1 << 20, b"x" * (1 << 30)), "cut off"),  # states 1 MB, and its frame 1 GB
+        (hostile(1 << 20, b"x" * (1 << 20), check_sum=1), "cut off"),
+        (hostile((1 << 24) + 200, channel_and_message((1 << 24) + 1)), "messages of more than"),
+    ],
+    ids=["chunk", "both", "frame", "check sum", "message"],
+)
+def test_memory_is_bounded_by_what_a_chunk_may_state(tmp_path: Path, content: bytes, said: str):
+    path = tmp_path / "hostile.mcap"
+    if said.startswith("messages"):
+        records = channel_and_message((1 << 24) + 1)
+        content = hostile(len(records), records)
+    path.write_bytes(content)
+    assert len(content) < 66_000
+    command = [sys.executable, "-c", READ_WITH_LITTLE, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
+    counts, reasons = done.stdout.split("|")
+    n, grown_kb = map(int, counts.split())
+    assert n == 0
+    assert grown_kb < 100_000
+    assert said in reasons
+
+
+def test_larger_chunks_are_rewritten_on_request(tmp_path: Path):
+    """Recordings of other programs may have larger chunks; the option of one command makes them readable by all."""
+    path, out = tmp_path / "large.mcap", tmp_path / "small.mcap"
+    records = b"".join(channel_and_message(8_000_000) for _ in range(5))
+    path.write_bytes(hostile(len(records), records))
+    assert read(path)[0] == []
+    refused = run_program("fusion", "repair", path)
+    assert refused.returncode == 2
+    assert "--max-chunk-mb" in refused.stderr
+    done = run_program("fusion", "repair", path, "--out", out, "--max-chunk-mb", "50")
+    assert done.returncode == 0, done.stderr
+    found, reader = read(out)
+    assert len(found) == 5
+    assert not reader.faults()
+    assert reader.is_complete
