@@ -67,7 +67,7 @@ class Message(NamedTuple):
     t_ns: int
 
 
-class Part(NamedTuple):
+class FilePart(NamedTuple):
     """A part of the file: a chunk or another record, or bytes that can't be read.
 
     Attributes:
@@ -174,7 +174,7 @@ class RecordingReader:
             faults["invalid records in the recording"] = self.n_invalid
         return faults
 
-    def parts(self) -> Iterator[Part]:
+    def parts(self) -> Iterator[FilePart]:
         """Yield chunks and other records; damaged ones that follow each other are one part."""
         position, damaged_from, has_end = len(MAGIC), None, False
         while position is not None and position < self._end and not has_end:
@@ -197,7 +197,7 @@ class RecordingReader:
         if self.statistics is not None and self._is_behind_damage:
             self._add_gap(self.statistics.end_ns)
 
-    def messages(self, part: Part) -> Iterator[Message]:
+    def messages(self, part: FilePart) -> Iterator[Message]:
         """Yield the messages of a part, and remember its channels."""
         at, records = 0, part.records or b""
         while at + RECORD.size <= len(records):
@@ -260,12 +260,12 @@ class RecordingReader:
                 return
         known[number] = content
 
-    def _damage(self, start: int, end: int) -> Part:
+    def _damage(self, start: int, end: int) -> FilePart:
         self.n_damaged += 1
         self._is_behind_damage = True
-        return Part(start, end, SET_ASIDE, None)
+        return FilePart(start, end, SET_ASIDE, None)
 
-    def _read_part(self, start: int) -> Part | None:
+    def _read_part(self, start: int) -> FilePart | None:
         """The record at a position; None if none begins there."""
         self.file.seek(start)
         head = self.file.read(RECORD.size)
@@ -278,14 +278,14 @@ class RecordingReader:
         if (sizes := self._chunk_sizes(length)) is not None:
             return self._read_chunk(start, end, opcode, *sizes)
         if opcode in SKIPPED or opcode >= PRIVATE or (opcode == Opcode.DATA_END and length == 4):
-            return Part(start, end, opcode, None if opcode == SET_ASIDE else b"")
+            return FilePart(start, end, opcode, None if opcode == SET_ASIDE else b"")
         is_misplaced = start == len(MAGIC) and opcode != Opcode.HEADER  # which each file begins with
         if opcode not in BETWEEN or length > self.limits.chunk_bytes or is_misplaced:
             return None
         content = self.file.read(length)
         if opcode != Opcode.HEADER:
-            return Part(start, end, opcode, head + content)
-        return Part(start, end, opcode) if self._read_header(content) else None
+            return FilePart(start, end, opcode, head + content)
+        return FilePart(start, end, opcode) if self._read_header(content) else None
 
     def _read_header(self, content: bytes) -> bool:
         """Whether a header's two texts fill it."""
@@ -319,23 +319,23 @@ class RecordingReader:
 
     def _read_chunk(
         self, start: int, end: int, opcode: int, compression: str, compressed: int, size: int, check_sum: int
-    ) -> Part:
+    ) -> FilePart:
         chunk = compression, compressed, size
         if compressed > self.limits.chunk_bytes:
-            return Part(start, end, opcode, b"", chunk)
+            return FilePart(start, end, opcode, b"", chunk)
         self.file.seek(end - compressed)
         data = self.file.read(compressed)
         try:
             if compression == "zstd" and zstandard.frame_content_size(data) not in (size, -1):
-                return Part(start, end, opcode, None, chunk)  # the frame contradicts its chunk
+                return FilePart(start, end, opcode, None, chunk)  # the frame contradicts its chunk
             if self._is_too_large(chunk):
-                return Part(start, end, opcode, b"", chunk)
+                return FilePart(start, end, opcode, b"", chunk)
             records = _decompress(data, compression, size)
         except Exception:  # whatever the decompressor raises: the chunk is damaged
             records = None
         if records is not None and (len(records) != size or check_sum not in (0, zlib.crc32(records))):
             records = None
-        return Part(start, end, opcode, records, chunk)
+        return FilePart(start, end, opcode, records, chunk)
 
     def _is_too_large(self, chunk: tuple[str, int, int]) -> bool:
         return max(chunk[1:]) > self.limits.chunk_bytes
@@ -371,7 +371,7 @@ class RecordingReader:
         if check_sum not in (0, zlib.crc32(summary + tail[: -len(MAGIC) - 4])):
             return
         self.is_complete, self._end = True, begin
-        for _ in self.messages(Part(begin, self._size, Opcode.FOOTER, summary)):  # its channels
+        for _ in self.messages(FilePart(begin, self._size, Opcode.FOOTER, summary)):  # its channels
             pass
         self._read_statistics(summary)
 

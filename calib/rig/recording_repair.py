@@ -15,7 +15,15 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, DataEnd, Footer, Header, McapRecord, Statistics
 
-from calib.rig.recording_reader import MAGIC, PROFILE, RECORD, SET_ASIDE, Part, ReadLimits, RecordingReader
+from calib.rig.recording_reader import (
+    MAGIC,
+    PROFILE,
+    RECORD,
+    SET_ASIDE,
+    FilePart,
+    ReadLimits,
+    RecordingReader,
+)
 from camera_node.foundation.errors import ConfigError
 
 HEADER = Header(profile=PROFILE, library="roundel")
@@ -43,7 +51,7 @@ class _IndexedChunk:
     """A complete chunk: its entry in the index, its place in the file, and the messages of each channel."""
 
     index: ChunkIndex
-    part: Part
+    part: FilePart
     counts: Counter[int]
 
 
@@ -54,7 +62,7 @@ class _Content:
     reader: RecordingReader
     is_sound: bool = True
     end: int = len(MAGIC)
-    damaged: list[Part] = field(default_factory=list)  # not marked yet
+    damaged: list[FilePart] = field(default_factory=list)  # not marked yet
     chunks: list[_IndexedChunk] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)  # messages by channel
 
@@ -123,13 +131,13 @@ def _read_content(file: IO[bytes], reader: RecordingReader) -> _Content:
     return content
 
 
-def _mark(part: Part) -> bytes:
+def _mark(part: FilePart) -> bytes:
     """The start of the record that a part becomes: a chunk whose opcode was damaged, or one to skip."""
     opcode = SET_ASIDE if part.records is None else Opcode.CHUNK
     return RECORD.pack(opcode, part.end - part.start - RECORD.size)
 
 
-def _chunk_index(part: Part, times: list[int]) -> ChunkIndex:
+def _chunk_index(part: FilePart, times: list[int]) -> ChunkIndex:
     compression, compressed_size, uncompressed_size = part.chunk or ("", 0, 0)
     return ChunkIndex(
         chunk_start_offset=part.start,
