@@ -77,7 +77,7 @@ newest:
 	@$(PYTHON) -m venv --clear build/newest
 	@$(BUILD_REQUIRES) | $(call PIP,build/newest) --upgrade -r /dev/stdin
 	@PATH="$(CURDIR)/build/newest/bin:$$PATH" $(call PIP,build/newest) --upgrade --no-build-isolation \
-	  -C build-dir=build/newest/native -e '.[server,dev]'
+	  --config-settings build-dir=build/newest/native -e '.[server,dev]'
 	@build/newest/bin/python -m pip freeze --exclude-editable > build/newest/versions.txt
 	$(call TEST,build/newest)
 
