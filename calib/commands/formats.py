@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`roundel calibrate import` and `roundel calibrate export`: recordings and rigs from and to other programs."""
 
-from collections.abc import Callable, Sequence
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
 from calib.commands.output import provenance, write_rig
@@ -14,11 +17,13 @@ from calib.formats import argus, caliscope, colmap, kalibr, multicamselfcal, ope
 from calib.formats.data import ForeignData, PixelOrigin, PointTable
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
+from camera_node.foundation.config import dump_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 
 Reader = Callable[[Sequence[Path], PixelOrigin], ForeignData]
 Writer = Callable[[Rig, Path, PixelOrigin], list[str]]
+FPS = 30  # in the printed command, for points without times; of synchronous cameras only the order of frames counts
 FormatName = Literal[
     "argus", "easywand", "dltdv", "multicamselfcal", "caliscope", "opencv", "kalibr", "colmap"
 ]
@@ -55,13 +60,21 @@ class _Conversion:
     """The folder for the files, which is made if it does not exist."""
     first_pixel: Literal[0, 1] | None = None
     """What the other program calls the first pixel; by default as the format says."""
-    y_up: bool | None = None
-    """Whether it counts rows from the lowest one; by default as the format says."""
+    y_up: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """It counts rows from the lowest one; Argus does."""
+    y_down: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """It counts rows from the top one; all others do."""
 
     def origin(self, of: Format) -> PixelOrigin:
-        """The pixel origin: that of the format, with the options that are given."""
+        """The pixel origin: that of the format, with the options that are given.
+
+        Raises:
+            ConfigError: the options contradict each other.
+        """
+        if self.y_up and self.y_down:
+            raise ConfigError("--y-up and --y-down exclude each other; give one of them, or none")
         first = of.origin.first if self.first_pixel is None else self.first_pixel
-        return PixelOrigin(first, of.origin.y_up if self.y_up is None else self.y_up)
+        return PixelOrigin(first, self.y_up or (of.origin.y_up and not self.y_down))
 
     def make_folder(self) -> None:
         """Make the folder `out`.
@@ -97,22 +110,51 @@ class ImportData(_Conversion):
         if rig is not None:
             write_rig(rig, self.out / "rig.yaml")
             say(f"{len(rig.cameras)} cameras, {len(rig.placed())} with poses: {', '.join(rig.cameras)}")
-        if data.points is not None:
-            self._write_points(data.points)
         for remark in data.remarks:
             say(remark)
+        if data.points is not None:
+            self._write_points(data, data.points)
 
-    def _write_points(self, points: PointTable) -> None:
+    def _write_points(self, data: ForeignData, points: PointTable) -> None:
         path = self.out / "observations.csv"
         points.write(path)
         markers, cameras = int(points.marker.max()) + 1, len(set(points.camera))
         frames = len(set(points.frame.tolist()))
         say(f"wrote {path}: {len(points)} points, {markers} markers, {cameras} cameras, {frames} frames")
-        clock = "--synchronised --fps RATE" if points.t_s is None else ""
-        say(
-            f"next: roundel calibrate wand --rig {self.out / 'rig.yaml'} --observations {path} {clock} "
-            "--wand WAND.yaml --out CALIBRATED.yaml"
-        )
+        wand = self.out / "wand.yaml"
+        if data.wand is not None:
+            write_atomically(wand, dump_yaml(data.wand))
+            say(f"wrote {wand}")
+        elif not wand.exists():
+            say(
+                f"write {wand} first: markers: [[x, y, z], ...], the place of each of the {markers} points, metres"
+            )
+        self._print_next(data, points, path, wand)
+
+    def _print_next(self, data: ForeignData, points: PointTable, path: Path, wand: Path) -> None:
+        """Print the command that calibrates from the files."""
+        rig = self.out / "rig.yaml"
+        if not data.cameras and not rig.exists():
+            say(f"write {rig} first: import the files of the cameras with the same --out")
+        words: list[object] = ["--rig", rig, "--observations", path]
+        words += ["--synchronised", "--fps", FPS] if points.t_s is None else []
+        words += ["--wand", wand]
+        if data.wand is not None and len(data.wand.markers) == 1 and (ends := _widest_pair(data.cameras)):
+            words += ["--distance", *ends]
+        words += ["--out", self.out / "calibrated.yaml"]
+        say("next: " + shlex.join(["roundel", "calibrate", "wand", *map(str, words)]))
+
+
+def _widest_pair(cameras: Mapping[str, Camera]) -> tuple[str, str, str] | None:
+    """The two cameras with poses that are farthest apart, and the metres between them: the scale for one marker."""
+    placed = {
+        name: camera.matrix()[:3, 3] for name, camera in cameras.items() if camera.T_world_cam is not None
+    }
+    gaps = {(a, b): float(np.linalg.norm(placed[a] - placed[b])) for a, b in combinations(placed, 2)}
+    if not gaps:
+        return None
+    a, b = max(gaps, key=gaps.__getitem__)
+    return a, b, f"{gaps[a, b]:.4f}"
 
 
 def make_rig(cameras: dict[str, Camera]) -> Rig:

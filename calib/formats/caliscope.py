@@ -3,8 +3,10 @@
 
 Cameras: tables `[cameras.0]`, or `[cam_0]`, with size, matrix, distortions, fisheye, and rotation (3 x 3 or Rodrigues
 vector) and translation from the world to the camera (src/caliscope/persistence.py, save_camera_array). Points: columns
-sync_index, cam_id or port, point_id, img_loc_x, img_loc_y, and frame_time in seconds, by each camera's own clock.
-Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
+sync_index, cam_id or port, keypoint_id (point_id before version 0.11), img_loc_x, img_loc_y; of version 0.11 also
+object_id, and obj_loc_x, obj_loc_y and obj_loc_z where the tracker knows the object: then the object is the wand.
+frame_time, in seconds by each camera's own clock, is a column, or in `timestamps.csv` beside. Pixel (0, 0) is the
+centre of the top-left pixel, as in OpenCV.
 """
 
 import csv
@@ -20,29 +22,59 @@ from calib.errors import CalibrationError
 from calib.formats.data import ForeignData, PixelOrigin, PointTable, make_camera, read_text
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
+from calib.rig.wand_file import WandBody
+from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector, vector_from_rotation
 
-COLUMNS = ("sync_index", "point_id", "img_loc_x", "img_loc_y")
+POINTS, TIMES = ("sync_index", "img_loc_x", "img_loc_y"), ("sync_index", "cam_id", "frame_time")
+PLACE = ("obj_loc_x", "obj_loc_y", "obj_loc_z")
 FROM_ZERO = PixelOrigin(0)
 MAX_FRAME, MAX_MARKER = 1e12, 1e6
+SAME_M = 1e-6  # of a point of a rigid object
 
 
 def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
-    """Read TOML files of cameras, a table of points, or both. Camera 0 is named cam0.
+    """Read the folder of a session, or TOML files of cameras, tables of points and of times. Camera 0 is named cam0.
 
     Raises:
         ConfigError, CalibrationError: a file is neither, or has impossible values.
     """
     cameras: dict[str, Camera] = {}
-    points = None
-    for path in paths:
+    tables = []
+    for path in _find_files(paths):
         if path.suffix.lower() == ".csv":
-            points = _read_points(path, origin)
+            tables.append(path)
         else:
             cameras |= _read_cameras(path)
-    return ForeignData(cameras, points)
+    times = [path for path in tables if path.stem.startswith("timestamps")]
+    points = [path for path in tables if path not in times]
+    if len(points) > 1 or len(times) > 1:
+        names = ", ".join(path.name for path in (points if len(points) > 1 else times))
+        raise ConfigError(f"{names} are several tables of one kind; give one of them")
+    if not points:
+        return ForeignData(cameras)
+    stamps = _read_times(times[0]) if times else {}
+    table, wand, remarks = _read_points(points[0], stamps, origin)
+    return ForeignData(cameras, table, wand, remarks)
+
+
+def _find_files(paths: Sequence[Path]) -> list[Path]:
+    """The given files; in place of a folder, the files of a session in it."""
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        inside = [path / "camera_array.toml", *sorted(path.glob("xy*.csv")), path / "timestamps.csv"]
+        inside = [file for file in inside if file.exists() and not file.name.startswith("xyz")]
+        if not inside:
+            raise ConfigError(
+                f"{path} has neither camera_array.toml nor xy.csv; give the folder of a session"
+            )
+        found += inside
+    return found
 
 
 def _read_cameras(path: Path) -> dict[str, Camera]:
@@ -93,31 +125,106 @@ def _is_absent(value: Any) -> bool:
     return value is None or isinstance(value, str) or len(value) == 0
 
 
-def _read_points(path: Path, origin: PixelOrigin) -> PointTable:
+def _rows(path: Path, columns: Sequence[str]) -> csv.DictReader:
+    """The rows of a table.
+
+    Raises:
+        ConfigError: a column is missing.
+    """
     reader = csv.DictReader(io.StringIO(read_text(path)))
     have = set(reader.fieldnames or ())
-    which = "cam_id" if "cam_id" in have else "port"
-    if missing := sorted({*COLUMNS, which} - have):
-        raise ConfigError(f"{path} lacks the columns {', '.join(missing)}; is it xy.csv of Caliscope?")
-    names, rows = [], []
+    missing = [name for name in columns if not have & set(name.split("|"))]
+    if missing:
+        names = ", ".join(missing).replace("|", " or ")
+        raise ConfigError(f"{path} lacks the columns {names}; is it a table of Caliscope?")
+    return reader
+
+
+def _read_times(path: Path) -> dict[tuple[int, int], float]:
+    """The time of each frame, by its number and its camera's."""
+    reader, times = _rows(path, TIMES), {}
     for row in reader:
-        try:
-            values = [float(row[name]) for name in COLUMNS]
-            if not (0 <= values[0] < MAX_FRAME and 0 <= values[1] < MAX_MARKER):
-                raise ValueError
-            time = float(row.get("frame_time") or "nan")
-            names.append(f"cam{int(float(row[which]))}")
-        except (TypeError, ValueError, OverflowError):
+        sync, camera, seconds = _numbers(path, reader.line_num, row, TIMES)
+        times[int(sync), int(camera)] = seconds
+    return times
+
+
+def _numbers(path: Path, line: int, row: Mapping[str, str], columns: Sequence[str]) -> list[float]:
+    """Finite numbers of a row.
+
+    Raises:
+        ConfigError: one is missing, or not finite or too large.
+    """
+    try:
+        values = [float(row[name]) for name in columns]
+    except (TypeError, ValueError):
+        raise ConfigError(f"{path}, line {line}: a value is not a number; write the table again") from None
+    if not all(abs(value) < MAX_FRAME for value in values):
+        raise ConfigError(f"{path}, line {line}: a value is out of range; write the table again")
+    return values
+
+
+def _read_points(
+    path: Path, stamps: Mapping[tuple[int, int], float], origin: PixelOrigin
+) -> tuple[PointTable, WandBody | None, tuple[str, ...]]:
+    """The points of the object that has most, and its shape where the table states it."""
+    reader = _rows(path, (*POINTS, "cam_id|port", "keypoint_id|point_id"))
+    have = set(reader.fieldnames or ())
+    camera_column = "cam_id" if "cam_id" in have else "port"
+    point_column = "keypoint_id" if "keypoint_id" in have else "point_id"
+    columns = (*POINTS, camera_column, point_column, *(("object_id",) if "object_id" in have else ()))
+    rows, places = [], []
+    for row in reader:
+        frame, u, v, camera, point, *objects = _numbers(path, reader.line_num, row, columns)
+        if not (frame >= 0 and 0 <= camera < MAX_MARKER and 0 <= point < MAX_MARKER):
             raise ConfigError(
-                f"{path}, line {reader.line_num}: a value is not a number, or out of range"
-            ) from None
-        rows.append([*values, time])
+                f"{path}, line {reader.line_num}: a number is out of range; write the table again"
+            )
+        stated = row.get("frame_time") or stamps.get((int(frame), int(camera)), "nan")
+        rows.append([frame, u, v, camera, point, objects[0] if objects else 0, _number_or_nan(stated)])
+        places.append([_number_or_nan(row.get(name)) for name in PLACE])
     if not rows:
         raise CalibrationError(f"{path} has no points")
-    frame, marker, u, v, t_s = np.array(rows).T
-    times = t_s if np.isfinite(t_s).all() else None
-    uv = origin.read(np.column_stack([u, v]))
-    return PointTable(names, frame.astype(np.intp), marker.astype(np.intp), uv, times)
+    table, place = np.array(rows), np.array(places)
+    objects, counts = np.unique(table[:, 5], return_counts=True)
+    chosen = table[:, 5] == objects[counts.argmax()]
+    table, place = table[chosen], place[chosen]
+    marker, wand = table[:, 4].astype(np.intp), None
+    if np.isfinite(place[:, :2]).all():
+        marker, wand = _read_object(marker, np.nan_to_num(place))
+    timed = np.isfinite(table[:, 6])
+    times = table[:, 6] if timed.all() else None
+    remarks = [f"{path.name} has {len(objects)} objects; that with most points is imported"] * (
+        len(objects) > 1
+    )
+    if times is None:
+        remarks.append(
+            f"{(~timed).sum()} of {len(timed)} points have no time in timestamps.csv or frame_time: frames of equal "
+            "number are taken as simultaneous"
+        )
+    names = [f"cam{int(camera)}" for camera in table[:, 3]]
+    uv = origin.read(table[:, 1:3])
+    return PointTable(names, table[:, 0].astype(np.intp), marker, uv, times), wand, tuple(remarks)
+
+
+def _number_or_nan(text: Any) -> float:
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        return np.nan
+    return value if abs(value) < MAX_FRAME else np.nan
+
+
+def _read_object(marker: Index, place: Array) -> tuple[Index, WandBody | None]:
+    """Points renumbered from 0, and the rigid body that they belong to; None if they move on it."""
+    numbers, first, marker = np.unique(marker, return_index=True, return_inverse=True)
+    body = place[first]
+    if np.abs(place - body[marker]).max() > SAME_M:
+        return numbers[marker], None
+    try:
+        return marker, WandBody(markers=tuple((x, y, z) for x, y, z in body.tolist()))
+    except ValueError as error:
+        raise CalibrationError(f"the object of the points: {error}") from None
 
 
 def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:

@@ -8,15 +8,18 @@ import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
+from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import Pose, invert, rotation_from_vector, skew
 
 MAX_FILE_BYTES = 1 << 28  # of a table of points: an hour of 16 cameras at 60 Hz takes a fifth of it
 GRID = 25  # points across and down the image
@@ -102,10 +105,12 @@ class PointTable:
 
 @dataclass(frozen=True, slots=True)
 class ForeignData:
-    """What was read from files of another program: cameras by name, points, and remarks for the user."""
+    """What was read from files of another program: cameras by name, points, the body that these points belong to where
+    its shape is known, and remarks for the user."""
 
     cameras: dict[str, Camera] = field(default_factory=dict)
     points: PointTable | None = None
+    wand: WandBody | None = None
     remarks: tuple[str, ...] = ()
 
 
@@ -191,6 +196,66 @@ def with_coefficients(name: str, lens: Lens, count: int) -> tuple[Lens, float]:
             f"it would be off by {off:.1f} px"
         )
     return shorter, off
+
+
+def place_by_projection(lens: Camera, P: Array, where: str) -> tuple[Camera, float]:
+    """The camera of a projection matrix that maps the world to undistorted pixels of a lens.
+
+    The calibration matrix of the projection is often another one than that of the lens, because the other program
+    adjusted it after the distortion was removed. Lens and rotation are adjusted to the viewing rays of both together.
+
+    Args:
+        lens: the lens that was used to remove the distortion.
+        P: (3, 4) projection matrix of any scale and sign.
+        where: what the errors name.
+
+    Returns:
+        the camera, and the largest distance between the pixels of one ray by it and by the two files, pixels.
+
+    Raises:
+        CalibrationError: the matrix is not that of a camera at a finite place.
+    """
+    K, R, centre = _decompose(P, where)
+    u, v = np.meshgrid(np.linspace(0, lens.width - 1, GRID), np.linspace(0, lens.height - 1, GRID))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    xy = lens.normalise(pixels)
+    known = np.isfinite(xy).all(axis=1)
+    undistorted = np.column_stack([xy[known], np.ones(known.sum())]) @ lens.K.T
+    rays, pixels = undistorted @ np.linalg.inv(K).T, pixels[known]
+    if not known.any() or not (rays[:, 2] > 0).all():
+        raise CalibrationError(f"{where}: the lens has no undistorted image; check its distortion")
+    fitted = lens.with_parameters([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.distortion])
+    turn = np.eye(3)
+    try:
+        for _ in range(STEPS):
+            uv, J_point, J_lens = fitted.project_with_jacobians(rays @ turn.T)
+            J = np.concatenate([J_lens, -J_point @ skew(rays @ turn.T)], axis=2)
+            step = np.linalg.lstsq(J.reshape(-1, J.shape[2]), (pixels - uv).ravel())[0]
+            fitted = fitted.with_parameters(fitted.parameters + step[:-3])
+            turn = rotation_from_vector(step[-3:]) @ turn
+    except (ValueError, np.linalg.LinAlgError):
+        raise CalibrationError(
+            f"{where}: no lens has these viewing rays; check the files of this camera"
+        ) from None
+    T = np.eye(4)
+    T[:3, :3] = turn @ R
+    T[:3, 3] = -T[:3, :3] @ centre
+    placed = make_camera(
+        **{name: getattr(fitted, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")},
+        T_world_cam=Pose.from_matrix(invert(T)),
+    )
+    return placed, _largest(pixels - fitted.project(rays @ turn.T))
+
+
+def _decompose(P: Array, where: str) -> tuple[Array, Array, Array]:
+    """The calibration matrix, the rotation from the world to the camera, and the camera's centre (3,), of a projection
+    matrix (3, 4) of any scale and sign."""
+    sides = np.linalg.norm(P[:, :3], axis=1) if np.isfinite(P).all() else np.zeros(3)
+    if not sides.all() or abs(np.linalg.det(P[:, :3])) < 1e-9 * sides.prod():
+        raise CalibrationError(f"{where} has no projection of a camera at a finite place")
+    K, R, centre = cv2.decomposeProjectionMatrix(P * np.sign(np.linalg.det(P[:, :3])))[:3]
+    signs = np.diag(np.sign(np.diag(K)))  # RQ decomposition is unique up to the signs of the diagonal
+    return K @ signs / abs(K[2, 2]), signs @ R, (centre[:3] / centre[3]).ravel()
 
 
 def _largest(offsets: Array) -> float:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Kalibr's `camchain.yaml` (https://github.com/ethz-asl/kalibr/wiki/yaml-formats).
+"""Kalibr's `camchain.yaml` (https://github.com/ethz-asl/kalibr/wiki/yaml-formats), and TagSLAM's `cameras.yaml`.
 
 cam0, cam1, ...: camera_model pinhole with intrinsics fu, fv, pu, pv; distortion_model radtan (OpenCV's k1, k2, p1, p2),
-equidistant (OpenCV's fisheye) or none; resolution; T_cn_cnm1, which takes points from the camera before into this one;
-timeshift_cam_imu in seconds: t_imu = t_cam + shift. The first camera is the world.
+plumb_bob (the same with k3; TagSLAM and ROS), equidistant (OpenCV's fisheye) or none; resolution; T_cn_cnm1, which
+takes points from the camera before into this one; timeshift_cam_imu in seconds: t_imu = t_cam + shift. The first
+camera is the world.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,14 +24,15 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import Pose, invert
 
 FROM_ZERO = PixelOrigin(0)
-MODELS = {"radtan": "pinhole", "equidistant": "fisheye", "none": "pinhole"}
+MODELS = {"radtan": "pinhole", "plumb_bob": "pinhole", "equidistant": "fisheye", "none": "pinhole"}
 COEFFICIENTS = 4
 ROTATION_TOLERANCE = 1e-3  # of R^T R from I
 
 
 def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
-    """Read one camchain. A camera has the name of its topic's first part, such as left of /left/image_raw, if these
-    differ; else cam0, cam1, ...
+    """Read one camchain; without transforms its cameras have no poses.
+
+    A camera has the name of its topic's first part, such as left of /left/image_raw, if these differ; else cam0, ...
 
     Raises:
         ConfigError, CalibrationError: the file is not a camchain of pinhole cameras.
@@ -51,7 +53,7 @@ def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
         chained &= k == 0 or "T_cn_cnm1" in entry
         shift = _number(where, entry.get("timeshift_cam_imu", 0.0))
         first_shift = shift if first_shift is None else first_shift
-        pose = Pose.from_matrix(T) if chained and len(entries) > 1 else None
+        pose = Pose.from_matrix(T) if chained and len(entries) > 1 and "T_cn_cnm1" in entries[1] else None
         cameras[f"cam{k}"] = _build(where, entry, origin, pose, 1e3 * (shift - first_shift))
     return ForeignData(_rename(cameras, entries))
 
@@ -79,14 +81,16 @@ def _build(
     if entry.get("camera_model") != "pinhole" or distortion_model not in MODELS:
         raise ConfigError(
             f"{where}: camera_model '{entry.get('camera_model')}' with distortion_model '{distortion_model}' can't be "
-            "imported; pinhole with radtan, equidistant or none can"
+            "imported; pinhole with radtan, plumb_bob, equidistant or none can"
         )
     try:
         fx, fy, cx, cy = (float(x) for x in entry["intrinsics"])
         width, height = (float(x) for x in entry["resolution"])
         distortion = tuple(float(x) for x in entry.get("distortion_coeffs") or ())
     except (KeyError, TypeError, ValueError):
-        raise ConfigError(f"{where}: intrinsics needs 4 numbers, resolution 2, distortion_coeffs 4") from None
+        raise ConfigError(
+            f"{where}: intrinsics needs 4 numbers, resolution 2, distortion_coeffs 4 or 5"
+        ) from None
     (cx, cy), lens = origin.read(np.array([[cx, cy]]))[0], {"fx": fx, "fy": fy}
     return make_camera(
         width=width,

@@ -1,39 +1,48 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """MultiCamSelfCal (Svoboda, Martinec and Pajdla 2005): a folder with points, image sizes, lenses and projections.
 
-`points.dat`: 3 C rows of homogeneous pixels (u, v, 1) of C cameras, one column a frame. `IdMat.dat`: C rows, 1 where a
-camera saw the light. `Res.dat`: width and height of each camera. `camera_order.txt`: their names, where flydra wrote
-one. `*.rad`, one a camera: `K11 = ...` to `K33` and `kc1` to `kc4`, OpenCV's k1, k2, p1, p2 (CalTechCal/goradf.m of
-strawlab/MultiCamSelfCal). `*.cal`, one a camera: the 3 x 4 matrix to undistorted pixels.
+Input: `points.dat`, 3 C rows of homogeneous pixels (u, v, 1) of C cameras, one column a frame; `IdMat.dat`, C rows, 1
+where a camera saw the light. Result: `cam<k>.points4cal.dat`, one row a point that was used, with the homogeneous point
+and pixel; the rows of one frame have equal points. `Res.dat`: width and height of each camera. `camera_order.txt`:
+their names, where flydra wrote one; `calibration_units.txt`, the unit of the world.
+
+`*.rad`, one a camera: `K11 = ...` to `K33` and `kc1` to `kc4`, OpenCV's k1, k2, p1, p2 (CalTechCal/goradf.m of
+strawlab/MultiCamSelfCal): they undistort. `*.Pmat.cal`: the 3 x 4 matrix to undistorted pixels, whose calibration
+matrix is another one. `basename<k>.cal` has the same projection rounded: the centre `C1 = ...` to `C3`, and `P11` to
+`P33`, which takes undistorted pixels to directions; it is used where the matrix is missing.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calib.errors import CalibrationError
 from calib.formats.data import (
+    MAX_OFF_PX,
     ForeignData,
     PixelOrigin,
     PointTable,
     make_camera,
+    place_by_projection,
     read_numbers,
     read_text,
     with_coefficients,
 )
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
+from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import require_name, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import Pose, invert
+from camera_node.geometry.pose import invert
 
 FROM_ZERO = PixelOrigin(0)
-ENTRY = re.compile(r"\s*(K[123][123]|kc[1-4])\s*=\s*(\S+)\s*")
-CAL_SHAPE, COEFFICIENTS = (3, 4), 4
+ENTRY = re.compile(r"\s*([A-Za-z]+\d+)\s*=\s*([^\s;]+)\s*;?\s*")
+CAL_SHAPE, POINT_COLUMNS, COEFFICIENTS = (3, 4), 7, 4
+METRES = {"millimeters": 1e-3, "mm": 1e-3, "centimeters": 1e-2, "cm": 1e-2, "meters": 1.0, "m": 1.0}
+LIGHT = WandBody(markers=((0.0, 0.0, 0.0),))
 
 
 def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
@@ -45,10 +54,10 @@ def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
     if len(paths) != 1 or not paths[0].is_dir():
         raise ConfigError("give the one folder that contains points.dat, IdMat.dat, Res.dat, *.rad or *.cal")
     files = {path.name.lower(): path for path in sorted(paths[0].iterdir()) if path.is_file()}
-    rad = _sort_numbered([path for path in files.values() if path.suffix == ".rad"])
-    cal = _sort_numbered([path for path in files.values() if path.suffix == ".cal"])
+    rad, cal, seen = (_sort_numbered(files, end) for end in (".rad", ".pmat.cal", ".points4cal.dat"))
+    cal = cal or _sort_numbered(files, ".cal")
     points = _read_matrix(files.get("points.dat"))
-    count = len(points) // 3 if points is not None else len(rad) or len(cal)
+    count = len(points) // 3 if points is not None else len(rad) or len(cal) or len(seen)
     names = _read_names(files.get("camera_order.txt"), count)
     sizes = _read_matrix(files.get("res.dat"))
     if rad or cal:
@@ -56,17 +65,25 @@ def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
             sizes is not None and sizes.shape == (count, 2),
             f"Res.dat must have {count} rows of width and height",
         )
-    _require(not rad or len(rad) == count, f"{len(rad)} .rad files of {count} cameras")
-    _require(not cal or len(cal) == count, f"{len(cal)} .cal files of {count} cameras")
-    lenses = [_read_rad(path) for path in rad] or [None] * len(cal)
-    cameras = {}
-    for k, lens in enumerate(lenses):
+    for kind, found in ((".rad", rad), (".cal", cal), (".points4cal.dat", seen if points is None else ())):
+        _require(not found or len(found) == count, f"{len(found)} {kind} files of {count} cameras")
+    unit_m = _read_unit(files.get("calibration_units.txt"))
+    cameras, remarks = {}, []
+    for k, name in enumerate(names if sizes is not None and (rad or cal) else ()):
         assert sizes is not None
-        cameras[names[k]] = _build(lens, _read_cal(cal[k]) if cal else None, sizes[k], origin)
-    table = (
-        _collect(points, _read_matrix(files.get("idmat.dat")), names, origin) if points is not None else None
-    )
-    return ForeignData(cameras, table)
+        P = _read_cal(cal[k], unit_m) if cal else None
+        cameras[name], off = _build(name, rad[k] if rad else None, P, sizes[k], origin)
+        if off > MAX_OFF_PX:
+            remarks.append(
+                f"camera '{name}': its .rad and .cal files together are no lens of OpenCV's model; the nearest one "
+                f"differs by up to {off:.1f} px, which roundel calibrate wand corrects"
+            )
+    table = None
+    if points is not None:
+        table = _collect(points, _read_matrix(files.get("idmat.dat")), names, origin)
+    elif seen:
+        table = _collect_used(seen, names, origin)
+    return ForeignData(cameras, table, LIGHT if table else None, tuple(remarks))
 
 
 def _require(condition: bool, fault: str) -> None:
@@ -74,9 +91,10 @@ def _require(condition: bool, fault: str) -> None:
         raise ConfigError(f"these files don't belong together: {fault}")
 
 
-def _sort_numbered(paths: Sequence[Path]) -> list[Path]:
-    """Paths by the last number in their names: camera 10 after camera 9."""
-    return sorted(paths, key=lambda path: ([int(n) for n in re.findall(r"\d+", path.name)][-1:], path.name))
+def _sort_numbered(files: Mapping[str, Path], end: str) -> list[Path]:
+    """Paths whose names have this end, by the last number before it: camera 10 after camera 9."""
+    chosen = [(re.findall(r"\d+", name[: -len(end)])[-1:], name) for name in files if name.endswith(end)]
+    return [files[name] for _, name in sorted(chosen, key=lambda pair: ([int(n) for n in pair[0]], pair[1]))]
 
 
 def _read_matrix(path: Path | None) -> Array | None:
@@ -99,7 +117,22 @@ def _read_names(path: Path | None, count: int) -> list[str]:
     return names
 
 
-def _read_rad(path: Path) -> dict[str, float]:
+def _read_unit(path: Path | None) -> float:
+    """Metres of one unit of the world; 1 where no file states it."""
+    if path is None:
+        return 1.0
+    unit = read_text(path).strip().lower().replace("metre", "meter")
+    if unit not in METRES:
+        raise ConfigError(f"{path}: the unit '{unit[:40]}' is unknown; write one of {', '.join(METRES)}")
+    return METRES[unit]
+
+
+def _read_entries(path: Path, needed: Sequence[str]) -> dict[str, float]:
+    """The numbers of a file of lines `name = number`.
+
+    Raises:
+        ConfigError: a needed one is missing, or one is not a finite number.
+    """
     values = {}
     for line in read_text(path).splitlines():
         if match := ENTRY.fullmatch(line):
@@ -107,47 +140,53 @@ def _read_rad(path: Path) -> dict[str, float]:
                 values[match[1]] = float(match[2])
             except ValueError:
                 raise ConfigError(f"{path}: '{line[:60]}' is not a number") from None
-    if missing := {"K11", "K13", "K22", "K23"} - set(values):
-        raise ConfigError(f"{path} lacks {', '.join(sorted(missing))}")
+    if missing := [name for name in needed if not np.isfinite(values.get(name, np.nan))]:
+        raise ConfigError(f"{path} lacks {', '.join(missing)}; copy the file again")
     return values
 
 
-def _read_cal(path: Path) -> Array:
-    P = _read_matrix(path)
-    if P is None or P.shape != CAL_SHAPE:
-        raise ConfigError(f"{path} is not a matrix of 3 x 4 numbers")
-    return P
+def _read_cal(path: Path, unit_m: float) -> Array:
+    """(3, 4) the projection matrix from metres."""
+    if "=" in read_text(path)[:1000]:
+        grid = [f"P{row}{column}" for row in range(1, 4) for column in range(1, 4)]
+        values = _read_entries(path, ["C1", "C2", "C3", *grid])
+        directions = np.array([values[name] for name in grid]).reshape(3, 3)
+        if not abs(np.linalg.det(directions)) > 0:
+            raise CalibrationError(f"{path} has no projection of a camera at a finite place")
+        M = np.linalg.inv(directions)
+        P = np.column_stack([M, -M @ [values["C1"], values["C2"], values["C3"]]])
+    else:
+        matrix = _read_matrix(path)
+        if matrix is None or matrix.shape != CAL_SHAPE:
+            raise ConfigError(f"{path} is not a matrix of 3 x 4 numbers")
+        P = matrix
+    return P @ np.diag([1 / unit_m, 1 / unit_m, 1 / unit_m, 1.0])
 
 
-def _build(lens: dict[str, float] | None, P: Array | None, size: Array, origin: PixelOrigin) -> Camera:
-    """A camera from its `.rad`, else from the calibration matrix of its projection; with the pose of this."""
-    K, pose = (None, None) if P is None else _decompose(P)
-    if lens is not None:
-        K = np.array([[lens["K11"], 0, lens["K13"]], [0, lens["K22"], lens["K23"]]])
-    assert K is not None
-    centre = origin.read(K[None, :2, 2])[0]
-    return make_camera(
-        width=size[0],
-        height=size[1],
-        fx=float(K[0, 0]),
-        fy=float(K[1, 1]),
-        cx=float(centre[0]),
-        cy=float(centre[1]),
-        distortion=tuple(lens.get(f"kc{k}", 0.0) for k in range(1, 5)) if lens else (),
-        T_world_cam=pose,
+def _build(
+    name: str, rad: Path | None, P: Array | None, size: Array, origin: PixelOrigin
+) -> tuple[Camera, float]:
+    """A camera from its `.rad` and its projection, of which one may be missing, and how far its pixels are off."""
+    to_zero = np.eye(3)
+    to_zero[:2, 2] = origin.read(np.zeros((1, 2)))[0]
+    P = None if P is None else to_zero @ P
+    width, height = size
+    if rad is None:
+        assert P is not None
+        bare = make_camera(width, height, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+        return place_by_projection(bare, P, f"the .cal file of '{name}'")
+    lens = _read_entries(rad, ["K11", "K13", "K22", "K23"])
+    centre = origin.read(np.array([[lens["K13"], lens["K23"]]]))[0].tolist()
+    camera = make_camera(
+        width,
+        height,
+        fx=lens["K11"],
+        fy=lens["K22"],
+        cx=centre[0],
+        cy=centre[1],
+        distortion=tuple(lens.get(f"kc{k}", 0.0) for k in range(1, 5)),
     )
-
-
-def _decompose(P: Array) -> tuple[Array, Pose]:
-    """The (3, 3) calibration matrix and the pose of a (3, 4) projection matrix of any scale and sign."""
-    if not np.isfinite(P).all() or abs(np.linalg.det(P[:, :3])) < 1e-12:
-        raise CalibrationError("a .cal file has no projection of a camera at a finite place")
-    K, R, centre = cv2.decomposeProjectionMatrix(P * np.sign(np.linalg.det(P[:, :3])))[:3]
-    signs = np.diag(np.sign(np.diag(K)))  # RQ decomposition is unique up to the signs of the diagonal
-    T = np.eye(4)
-    T[:3, :3] = (signs @ R).T
-    T[:3, 3] = (centre[:3] / centre[3]).ravel()
-    return K @ signs / abs(K[2, 2]), Pose.from_matrix(T)
+    return (camera, 0.0) if P is None else place_by_projection(camera, P, f"the .cal file of '{name}'")
 
 
 def _collect(points: Array, seen: Array | None, names: Sequence[str], origin: PixelOrigin) -> PointTable:
@@ -162,6 +201,27 @@ def _collect(points: Array, seen: Array | None, names: Sequence[str], origin: Pi
         raise CalibrationError("points.dat has no points")
     uv = origin.read(stacked[camera, :2, frame])
     return PointTable([names[k] for k in camera.tolist()], frame, np.zeros(len(frame), np.intp), uv)
+
+
+def _collect_used(paths: Sequence[Path], names: Sequence[str], origin: PixelOrigin) -> PointTable:
+    """The points that the calibration used. Frames have lost their numbers: they are numbered in their order."""
+    tables = []
+    for path in paths:
+        table = _read_matrix(path)
+        if table is None or table.shape[1] != POINT_COLUMNS or not np.isfinite(table).all():
+            raise ConfigError(
+                f"{path} needs {POINT_COLUMNS} finite numbers a row: a homogeneous point and a pixel"
+            )
+        tables.append(table)
+    frames: dict[tuple[float, ...], int] = {}
+    for table in sorted(tables, key=len, reverse=True):
+        for point in map(tuple, table[:, :3].tolist()):
+            frames.setdefault(point, len(frames))
+    camera = [name for name, table in zip(names, tables, strict=True) for _ in range(len(table))]
+    stacked = np.concatenate(tables)
+    frame = np.array([frames[point] for point in map(tuple, stacked[:, :3].tolist())], np.intp)
+    uv = origin.read(stacked[:, 4:6] / stacked[:, 6:])
+    return PointTable(camera, frame, np.zeros(len(frame), np.intp), uv)
 
 
 def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:

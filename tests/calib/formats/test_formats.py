@@ -2,14 +2,18 @@
 """Files in the layouts of other programs are read as they mean it, and what is written is read back as it was."""
 
 import contextlib
+import os
 import re
+import shlex
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
+import tyro
 
+from calib.commands.calibrate_wand import Wand
 from calib.commands.formats import FORMATS, ExportRig, FormatName, ImportData, make_rig
 from calib.errors import CalibrationError
 from calib.formats.data import ForeignData, with_coefficients
@@ -127,6 +131,13 @@ def read(name: FormatName, folder: Path, files: dict[str, str]) -> ForeignData:
     return chosen.read(paths, chosen.origin)
 
 
+def read_folder(name: FormatName, folder: Path) -> ForeignData:
+    """Read the files that are in a folder already."""
+    chosen = FORMATS[name]
+    assert chosen.read is not None
+    return chosen.read([folder], chosen.origin)
+
+
 def test_an_easywand_profile_has_a_row_for_each_camera(tmp_path: Path):
     cameras = read("easywand", tmp_path, {"profile.txt": EASYWAND_PROFILE}).cameras
     assert list(cameras) == ["cam1", "cam2", "cam3"]
@@ -159,17 +170,13 @@ def test_a_wand_table_without_names_has_the_cameras_of_the_profile(tmp_path: Pat
     assert points.uv[2].tolist() == [12.0, 13.0]
 
 
-def test_multicamselfcal_folder(tmp_path: Path):
+def test_multicamselfcal_input(tmp_path: Path):
     """Points of two cameras in three frames; IdMat marks one as not seen although points.dat has numbers."""
-    truth = ring(2).truth
-    P = [c.K @ invert(c.matrix())[:3] for c in truth.cameras.values()]
     files = {
         "points.dat": "1 2 NaN\n11 12 NaN\n1 1 NaN\n5.5 6.5 7.5\n15 16 17\n1 1 1\n",
         "IdMat.dat": "1 1 0\n1 0 1\n",
-        "Res.dat": "800 600\n800 600\n",
-        "camera1.Pmat.cal": "\n".join(" ".join(map(str, row)) for row in -3.7 * P[0]),
-        "camera2.Pmat.cal": "\n".join(" ".join(map(str, row)) for row in 0.2 * P[1]),
-        "basename1.rad": "K11 = 520.0\nK12 = 0.0\nK13 = 402.0\nK22 = 522.0\nK23 = 297.0\n\nkc1 = -0.1\nkc2 = 0.03\n",
+        "Res.dat": "800.0; 600.0;\n800.0; 600.0;\n",
+        "basename1.rad": "K11 = 520.0;\nK12 = 0.0\nK13 = 402.0\nK22 = 522.0\nK23 = 297.0\n\nkc1 = -0.1\nkc2 = 0.03\n",
         "basename2.rad": "K11 = 530.0\nK12 = 0.0\nK13 = 402.0\nK22 = 532.0\nK23 = 297.0\n\nkc1 = -0.1\nkc4 = -0.01\n",
     }
     data = read("multicamselfcal", tmp_path, files)
@@ -178,10 +185,93 @@ def test_multicamselfcal_folder(tmp_path: Path):
     assert points.camera == ["cam1", "cam1", "cam2", "cam2"]
     assert points.frame.tolist() == [0, 1, 0, 2]
     assert points.uv.tolist() == [[1, 11], [2, 12], [5.5, 15], [7.5, 17]]
-    for found, camera in zip(data.cameras.values(), truth.cameras.values(), strict=True):
-        assert found.matrix() == pytest.approx(camera.matrix(), abs=1e-9)
     assert data.cameras["cam2"].parameters[:4] == pytest.approx([530, 532, 402, 297])
     assert data.cameras["cam2"].distortion == (-0.1, 0.0, 0.0, -0.01)
+
+
+def write_selfcal_result(folder: Path) -> Rig:
+    """Write a result folder of MultiCamSelfCal as flydra keeps it, in millimetres; return the true rig.
+
+    Three cameras see 40 points, those of 10 only two of them. As in the real program, the calibration matrix of a
+    projection is another than that of its lens: the projection maps to pixels that the lens undistorted.
+    """
+    cameras = {n: c.with_parameters(c.parameters[:8]) for n, c in ring(3).truth.cameras.items()}
+    points = np.random.default_rng(2).uniform([-0.5, -0.5, 0.5], [0.5, 0.5, 1.2], (40, 3))
+    larger = 1.1
+    for k, camera in enumerate(cameras.values(), 1):
+        K, mm = camera.K, np.diag([1e-3, 1e-3, 1e-3, 1.0])
+        K_rad = np.array([[K[0, 0] / larger, 0, K[0, 2]], [0, K[1, 1] / larger, K[1, 2]], [0, 0, 1]])
+        k1, k2, p1, p2 = camera.distortion
+        kc = (k1 / larger**2, k2 / larger**4, p1 / larger, p2 / larger)
+        entries = [f"K{i + 1}{j + 1} = {K_rad[i, j]:.16f}" for i in range(3) for j in range(3)]
+        entries += ["", *(f"kc{i} = {value:.16f}" for i, value in enumerate(kc, 1))]
+        (folder / f"basename{k}.rad").write_text("\n".join(entries) + "\n")
+        P = -0.004 * K @ invert(camera.matrix())[:3] @ mm
+        np.savetxt(folder / f"camera{k}.Pmat.cal", P)
+        centre, toward = 1e3 * camera.matrix()[:3, 3], np.linalg.inv(P[:, :3])
+        lines = [f"C{i} = {value:.6f} " for i, value in enumerate(centre, 1)] + [""]
+        lines += [f"P{i + 1}{j + 1} = {toward[i, j]:.6f} " for i in range(3) for j in range(3)]
+        (folder / f"basename{k}.cal").write_text("\n".join(lines) + "\n")
+        seen = points[10:] if k == 3 else points
+        one, uv = np.ones((len(seen), 1)), camera.project_world(seen)
+        np.savetxt(folder / f"cam{k}.points4cal.dat", np.hstack([1e3 * seen, one, uv, one]), fmt="%16.7e")
+    (folder / "Res.dat").write_text("800 600\n" * 3)
+    (folder / "camera_order.txt").write_text("north_0\neast_0\nsouth_0\n")
+    (folder / "calibration_units.txt").write_text("millimeters\n")
+    return Rig(cameras=dict(zip(["north_0", "east_0", "south_0"], cameras.values(), strict=True)))
+
+
+def test_a_result_of_multicamselfcal_has_lenses_poses_and_the_points_that_were_used(tmp_path: Path):
+    truth = write_selfcal_result(tmp_path)
+    data = read("multicamselfcal", tmp_path, {})
+    assert list(data.cameras) == list(truth.cameras)
+    for name, camera in truth.cameras.items():
+        assert data.cameras[name].matrix() == pytest.approx(camera.matrix(), abs=1e-6)
+        assert data.cameras[name].parameters == pytest.approx(camera.parameters, rel=1e-5, abs=1e-6)
+    points = data.points
+    assert points is not None
+    assert np.bincount(points.frame).tolist() == [2] * 10 + [3] * 30
+    assert not data.remarks
+
+
+def test_the_rounded_projections_of_multicamselfcal_are_used_where_there_are_no_others(tmp_path: Path):
+    """They have three digits: pixels of a millionth in 1/f."""
+    truth = write_selfcal_result(tmp_path)
+    for path in tmp_path.glob("*.Pmat.cal"):
+        path.unlink()
+    found = read("multicamselfcal", tmp_path, {}).cameras
+    for name, camera in truth.cameras.items():
+        at = [[0.1, -0.2, 0.9], [-0.3, 0.2, 0.6]]
+        assert found[name].project_world(at) == pytest.approx(camera.project_world(at), abs=3.0)
+
+
+def test_a_projection_that_no_lens_has_is_reported_with_its_error(tmp_path: Path):
+    """The centre of distortion is 80 px from that of the projection."""
+    write_selfcal_result(tmp_path)
+    rad = tmp_path / "basename2.rad"
+    shift = {"K13": 80.0, "K23": 60.0}
+    lines = [line.split(" = ") for line in rad.read_text().splitlines()]
+    lines = [f"{n[0]} = {float(n[1]) + shift.get(n[0], 0.0)}" if len(n) == 2 else "" for n in lines]
+    rad.write_text("\n".join(lines).replace("kc1 = -", "kc1 = -1") + "\n")
+    assert "camera 'east_0'" in read("multicamselfcal", tmp_path, {}).remarks[0]
+
+
+def printed_command(capsys: pytest.CaptureFixture[str], data: ImportData) -> list[str]:
+    """The words of the command that an import prints as the next one, after `roundel calibrate wand`."""
+    capsys.readouterr()
+    data.run()
+    lines = capsys.readouterr().out.replace("\n", " ")
+    return shlex.split(lines.split("next: ")[1])[3:]
+
+
+@pytest.mark.parametrize("name", ["multicamselfcal", "caliscope"])
+def test_the_printed_command_calibrates(tmp_path: Path, capsys, name: FormatName):
+    """A result of MultiCamSelfCal, scaled by the distance of its cameras, and a board of Caliscope."""
+    truth = write_selfcal_result(tmp_path) if name == "multicamselfcal" else write_caliscope_session(tmp_path)
+    words = printed_command(capsys, ImportData(format=name, files=(tmp_path,), out=tmp_path / "in"))
+    tyro.cli(Wand, args=words).run()
+    back = load_rig(tmp_path / "in" / "calibrated.yaml")
+    assert camera_errors(back, truth)[0].max() < 0.01
 
 
 def test_caliscope_cameras_and_points(tmp_path: Path):
@@ -198,6 +288,92 @@ def test_caliscope_cameras_and_points(tmp_path: Path):
     assert points.t_s.tolist() == [1.25, 1.25, 1.31]
     assert points.marker.tolist() == [0, 3, 3]
     assert points.camera == ["cam0", "cam0", "cam2"]
+
+
+def write_caliscope_session(folder: Path) -> Rig:
+    """Write a session as Caliscope 0.11 writes it, and return the true rig: four cameras see a board of 3 x 4 corners,
+    of which corner 5 is never detected, in 40 frames, with 0.1 px of noise."""
+    truth, rng = ring(4).truth, np.random.default_rng(3)
+    FORMATS["caliscope"].write(truth, folder, FORMATS["caliscope"].origin)
+    corners = np.array([[0.1 * (k % 3), 0.1 * (k // 3), 0.0] for k in range(12)])
+    rows = ["sync_index,cam_id,object_id,keypoint_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y,obj_loc_z"]
+    times = ["sync_index,cam_id,frame_index,frame_time"]
+    for frame in range(40):
+        t_ns = 300_000_000 * frame
+        at = transform(ring(4).wand_pose(1e-9 * t_ns), corners)
+        for number, camera in enumerate(truth.cameras.values()):
+            times.append(f"{35 + frame},{number},{frame},{25 + 1e-9 * t_ns}")
+            uv = camera.project_world(at) + 0.1 * rng.standard_normal((12, 2))
+            for k in np.flatnonzero(camera.sees(uv)):
+                if k != 5:
+                    place = ",".join(f"{x:g}" for x in corners[k])
+                    rows.append(f"{35 + frame},{number},0,{k},{uv[k, 0]:.6f},{uv[k, 1]:.6f},{place}")
+    (folder / "xy_CHARUCO.csv").write_text("\n".join(rows) + "\n")
+    (folder / "xyz_CHARUCO.csv").write_text(
+        "sync_index,object_id,keypoint_id,x_coord,y_coord,z_coord,frame_time\n"
+    )
+    (folder / "timestamps.csv").write_text("\n".join(times) + "\n")
+    return truth
+
+
+def test_a_session_of_caliscope_0_11_has_its_board_and_times(tmp_path: Path):
+    """Corners are numbered without the one that no camera ever saw."""
+    write_caliscope_session(tmp_path)
+    data = read_folder("caliscope", tmp_path)
+    assert data.wand is not None
+    assert len(data.wand.markers) == 11
+    assert data.wand.markers[5] == (0.0, 0.2, 0.0)
+    assert data.points is not None
+    assert data.points.t_s is not None
+    assert data.points.t_s.min() == pytest.approx(25.0)
+    (tmp_path / "timestamps.csv").unlink()
+    untimed = read_folder("caliscope", tmp_path)
+    assert untimed.points is not None
+    assert untimed.points.t_s is None
+    assert "have no time" in untimed.remarks[0]
+
+
+def test_cameras_without_transforms_have_no_poses_whoever_wrote_them(tmp_path: Path):
+    """Kalibr's radtan, and plumb_bob with k3, which TagSLAM writes."""
+    parts = CAMCHAIN.split("  T_cn_cnm1:")
+    bare = parts[0] + "  rostopic:" + parts[1].split("  rostopic:")[1]
+    assert not any(c.T_world_cam for c in read("kalibr", tmp_path, {"a.yaml": bare}).cameras.values())
+    tagslam = bare.replace("radtan", "plumb_bob").replace("0.0001]", "0.0001, 0.02]")
+    cameras = read("kalibr", tmp_path, {"a.yaml": tagslam}).cameras
+    assert cameras["left"].distortion == (-0.277, 0.067, 0.0009, 0.0001, 0.02)
+    assert not any(camera.T_world_cam for camera in cameras.values())
+
+
+def test_the_direction_of_y_is_an_option_of_the_command_line(tmp_path: Path):
+    words = ["--format", "dltdv", "--out", str(tmp_path / "in"), "profile.txt"]
+    origins = [
+        tyro.cli(ImportData, args=[*more, *words]).origin(FORMATS[name])
+        for name, more in (("dltdv", []), ("dltdv", ["--y-up"]), ("argus", []), ("argus", ["--y-down"]))
+    ]
+    assert [origin.y_up for origin in origins] == [False, True, True, False]
+    with pytest.raises(ConfigError, match="exclude each other"):
+        tyro.cli(ImportData, args=["--y-up", "--y-down", *words]).origin(FORMATS["dltdv"])
+
+
+DATA = Path(os.environ.get("ROUNDEL_SHARED_DATA", "/work/shared/data"))
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "files", "cameras", "points"),
+    [
+        ("multicamselfcal", "multicamselfcal_result", [""], 5, 2122),
+        ("caliscope", "caliscope_current", ["camera_array.toml", "xy_CHARUCO.csv"], 4, 2175),
+        ("kalibr", "tag_wand", ["camchain.yaml"], 8, 0),
+        ("kalibr", "tag_wand", ["camchain_tagslam.yaml"], 8, 0),
+    ],
+)
+def test_recordings_of_others_open_unedited(name: FormatName, folder, files, cameras: int, points: int):
+    if not (DATA / folder).is_dir():
+        pytest.skip(f"{DATA / folder} is absent")
+    chosen = FORMATS[name]
+    assert chosen.read is not None
+    data = chosen.read([DATA / folder / file for file in files], chosen.origin)
+    assert (len(data.cameras), len(data.points or [])) == (cameras, points)
 
 
 def test_kalibr_chain(tmp_path: Path):
@@ -245,6 +421,25 @@ BROKEN = {
         {"points.dat": "1\n1\n1\n1\n1\n1\n", "a1.rad": "K11 = 1\n", "Res.dat": "9 9\n9 9\n"},
         "1 .rad files of 2 cameras",
     ),
+    "an unknown unit": (
+        "multicamselfcal",
+        {"points.dat": "1\n1\n1\n", "calibration_units.txt": "cubits\n"},
+        "the unit 'cubits' is unknown",
+    ),
+    "a used point without a pixel": (
+        "multicamselfcal",
+        {"cam1.points4cal.dat": "1 2 3 1 nan 5 1\n"},
+        "7 finite numbers a row",
+    ),
+    "a direction matrix of zeros": (
+        "multicamselfcal",
+        {
+            "c1.cal": "C1 = 0\nC2 = 0\nC3 = 0\n"
+            + "".join(f"P{i}{j} = 0\n" for i in (1, 2, 3) for j in (1, 2, 3)),
+            "Res.dat": "9 9\n",
+        },
+        "no projection",
+    ),
     "rows of different lengths": ("multicamselfcal", {"points.dat": "1 2\n1\n"}, "not a matrix"),
     "a singular projection": (
         "multicamselfcal",
@@ -254,6 +449,12 @@ BROKEN = {
     "no TOML": ("caliscope", {"a.toml": "[cameras"}, "not valid TOML"),
     "no cameras": ("caliscope", {"a.toml": "fps = 6\n"}, r"no tables \[cameras.0\]"),
     "no size": ("caliscope", {"a.toml": "[cameras.0]\nmatrix = [1]\n"}, "camera 0 has no usable"),
+    "a time that is no number": (
+        "caliscope",
+        {"xy.csv": XY, "timestamps.csv": "sync_index,cam_id,frame_index,frame_time\n1,1,1,x\n"},
+        "timestamps.csv, line 2: a value is not a number",
+    ),
+    "two tables of points": ("caliscope", {"xy.csv": XY, "xy_2.csv": XY}, "give one of them"),
     "other columns": ("caliscope", {"xy.csv": "frame,x,y\n1,2,3\n"}, "lacks the columns"),
     "another YAML": ("kalibr", {"a.yaml": "cameras: {}\n"}, "is it a camchain"),
     "an omni model": (
