@@ -68,7 +68,7 @@ constraints:
 	@$(BUILD_REQUIRES) > build/resolver/build.in
 	@{ echo "# Versions of every package that the demo, the tests and CI install. Made by \`make constraints\`."; \
 	  build/resolver/bin/uv pip compile --quiet --upgrade --universal --python-version 3.11 --no-header --no-annotate \
-	    --extra server --extra dev --extra benchmarks pyproject.toml build/resolver/build.in; } > build/resolver/constraints.txt
+	    --extra server --extra dev --extra benchmarks --extra rerun pyproject.toml build/resolver/build.in; } > build/resolver/constraints.txt
 	@mv build/resolver/constraints.txt constraints.txt
 	@git --no-pager diff --stat constraints.txt
 

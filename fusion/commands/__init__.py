@@ -122,6 +122,15 @@ COMMANDS = (
         "write the poses of a recording for another program",
         "export:export",
         "roundel export monday.mcap poses.c3d",
+        "roundel export monday.mcap poses.parquet",
+    ),
+    _command(
+        "Recordings",
+        "plot",
+        "draw the trajectories of a recording and their uncertainty",
+        "plot:plot",
+        "roundel plot monday.mcap",
+        "roundel plot monday.mcap --compare tuesday.mcap --out apart.png",
     ),
     _command(
         "Bridges",

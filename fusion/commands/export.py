@@ -11,20 +11,31 @@ from fusion.export.pose_formats import (
     write_c3d,
     write_csv,
     write_foxglove,
+    write_parquet,
+    write_rerun,
     write_rosbag,
     write_trc,
     write_tum,
 )
 from fusion.export.recorded_poses import RecordedPoses
 
-Format = Literal["c3d", "trc", "csv", "tum", "rosbag", "foxglove"]
+Format = Literal["c3d", "trc", "csv", "tum", "parquet", "rerun", "rosbag", "foxglove"]
 FORMATS: dict[str, Format] = {
     ".c3d": "c3d",
     ".trc": "trc",
     ".csv": "csv",
     ".tum": "tum",
+    ".parquet": "parquet",
+    ".rrd": "rerun",
     "": "rosbag",
     ".mcap": "foxglove",
+}
+WRITERS = {
+    "csv": write_csv,
+    "parquet": write_parquet,
+    "rerun": write_rerun,
+    "rosbag": write_rosbag,
+    "foxglove": write_foxglove,
 }
 
 
@@ -42,7 +53,8 @@ def export(
 
     Args:
         recording: the MCAP file of roundel record or roundel replay.
-        out: the file to write: .c3d, .trc, .csv, .tum, or .mcap for Foxglove; without suffix a ROS 2 bag, a folder.
+        out: the file to write: .c3d, .trc, .csv, .tum, .parquet, .rrd for Rerun, or .mcap
+            for Foxglove; without suffix a ROS 2 bag, a folder.
         format: the format, if the suffix does not say it.
         robots: names of the robots to write; all unless given.
         rate_hz: frames a second (C3D, TRC); the rate of the poses unless given.
@@ -51,7 +63,8 @@ def export(
     chosen = format or FORMATS.get(out.suffix)
     if chosen is None:
         raise ConfigError(
-            f"{out.name} does not say its format; end it in .c3d, .trc, .csv, .tum or .mcap, or give --format"
+            f"{out.name} does not say its format; end it in .c3d, .trc, .csv, .tum, .parquet, .rrd or "
+            ".mcap, or give --format"
         )
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another name, or --force to replace it")
@@ -74,5 +87,5 @@ def _write(format: Format, poses: RecordedPoses, out: Path, rate_hz: float | Non
         write = write_c3d if format == "c3d" else write_trc
         write(sample_points(poses, rate_hz), out)
     else:
-        {"csv": write_csv, "rosbag": write_rosbag, "foxglove": write_foxglove}[format](poses, out)
+        WRITERS[format](poses, out)
     return [out]

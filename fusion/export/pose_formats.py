@@ -6,14 +6,18 @@ import csv
 import io
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from calib.rig.camera import Camera
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
+from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.bridges.foxglove_channels import FoxgloveChannels
 from fusion.bridges.ros2_messages import odometries, pose_stamped, transforms
 from fusion.bridges.ros2_node import ros_name
@@ -23,6 +27,8 @@ from fusion.protocol.pose_messages import RobotPose
 
 MAX_FRAMES = 65535  # of a C3D file, whose counter has 16 bits
 MM = 1000.0
+TRAIL_M = 0.004  # radius of a drawn trail
+ROW_GROUP = 1 << 14  # of a Parquet file: 10 MB in memory
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
 
 
@@ -62,6 +68,66 @@ def _row(pose: RobotPose) -> list:
     numbers = (*pose.position, *pose.quaternion_wxyz, *pose.velocity, *pose.angular_velocity)
     digits = [f"{number:.7g}" for number in numbers]
     return [pose.t_ns, pose.robot, *digits, pose.state, pose.n_markers, len(pose.cameras)]
+
+
+def write_parquet(poses: Iterable[RobotPose], path: Path) -> None:
+    """Write a table with one row for each pose, also of lost robots, in row groups of `ROW_GROUP`.
+
+    It has `COLUMNS`, and `timestamp` (s since the first pose) and `frame_index` (the pose's number of its robot) as
+    LeRobot's datasets name them; `cameras` that saw the robot, `residual_px`, `latency_ms`, and `covariance` (12 x 12,
+    row by row, in the order of `RobotPose`).
+
+    Raises:
+        ConfigError: pyarrow is missing, or the file can't be written.
+    """
+    arrow, parquet = (require(name, "parquet", "Parquet") for name in ("pyarrow", "pyarrow.parquet"))
+    schema = _schema(arrow)
+    rows: list[tuple] = []
+    start_ns: int | None = None
+    counts: Counter[str] = Counter()
+    with new_path(path) as part, parquet.ParquetWriter(part, schema, compression="zstd") as writer:
+
+        def write_group() -> None:
+            columns = [list(column) for column in zip(*rows, strict=True)]
+            writer.write_batch(arrow.record_batch(columns, schema=schema))
+            rows.clear()
+
+        for pose in poses:
+            start_ns = pose.t_ns if start_ns is None else start_ns
+            rows.append(_parquet_row(pose, (pose.t_ns - start_ns) / 1e9, counts[pose.robot]))
+            counts[pose.robot] += 1
+            if len(rows) == ROW_GROUP:
+                write_group()
+        if rows:
+            write_group()
+
+
+def _schema(arrow: Any) -> Any:
+    name = arrow.dictionary(arrow.int32(), arrow.string())
+    types = {"t_ns": arrow.int64(), "timestamp": arrow.float64(), "frame_index": arrow.int64(), "robot": name}
+    types |= dict.fromkeys(COLUMNS.split(",")[2:15], arrow.float64())
+    types |= {"state": name, "n_markers": arrow.int32(), "n_cameras": arrow.int32()}
+    types |= {"cameras": arrow.list_(arrow.string()), "residual_px": arrow.float32()}
+    types |= {"latency_ms": arrow.float32(), "covariance": arrow.list_(arrow.float32(), 144)}
+    return arrow.schema(
+        list(types.items()), metadata={"frame": "world, metres, z up", "t_ns": "UTC, of the exposure"}
+    )
+
+
+def _parquet_row(pose: RobotPose, seconds: float, index: int) -> tuple:
+    numbers = (*pose.position, *pose.quaternion_wxyz, *pose.velocity, *pose.angular_velocity)
+    used = (pose.state, pose.n_markers, len(pose.cameras), pose.cameras, pose.residual_px)
+    latency_ms = None if pose.latency is None else pose.latency.total_ms
+    return (
+        pose.t_ns,
+        seconds,
+        index,
+        pose.robot,
+        *numbers,
+        *used,
+        latency_ms,
+        pose.covariance_matrix.ravel(),
+    )
 
 
 def write_tum(poses: RecordedPoses, path: Path) -> list[Path]:
@@ -175,6 +241,67 @@ def write_foxglove(poses: RecordedPoses, path: Path) -> None:
                 bodies = poses.bodies
                 channels.add_bodies(bodies, pose.t_ns)
             channels.add_poses([pose])
+
+
+def write_rerun(poses: RecordedPoses, path: Path) -> None:
+    """Write a recording of Rerun: the robots with their markers, trails and uncertainty (two standard deviations), and
+    the cameras, on the timeline `capture`.
+
+    Raises:
+        ConfigError: rerun-sdk is missing, or the file can't be written.
+    """
+    rr = require("rerun", "rerun", "Rerun")
+    stream = rr.RecordingStream("roundel")
+    bodies = cameras = None
+    try:
+        with new_path(path) as part:
+            stream.save(part)
+            stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            for pose in poses:
+                stream.set_time("capture", timestamp=np.datetime64(pose.t_ns, "ns"))
+                if poses.cameras is not cameras:
+                    cameras = poses.cameras
+                    for name, camera in cameras.items():
+                        _log_camera(rr, stream, f"world/cameras/{name}", camera)
+                if poses.bodies is not bodies:
+                    bodies = poses.bodies
+                    for name, body in bodies.items():
+                        markers = rr.Points3D(body.points, radii=body.diameter_m / 2)
+                        stream.log(f"world/robots/{name}/markers", markers)
+                _log_pose(rr, stream, pose)
+            stream.disconnect()  # writes what is buffered
+    finally:
+        stream.disconnect()
+
+
+def _log_camera(rr: Any, stream: Any, entity: str, camera: Camera) -> None:
+    size = (camera.width, camera.height)
+    stream.log(f"{entity}/image", rr.Pinhole(image_from_camera=camera.K, resolution=size))
+    if camera.T_world_cam is not None:
+        T = camera.matrix()
+        stream.log(entity, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+
+
+def _log_pose(rr: Any, stream: Any, pose: RobotPose) -> None:
+    entity = f"world/robots/{pose.robot}"
+    stream.log(f"states/{pose.robot}", rr.TextLog(pose.state))
+    if pose.state == "lost":
+        stream.log(entity, rr.Clear(recursive=False))
+        return
+    w, x, y, z = pose.quaternion_wxyz
+    stream.log(entity, rr.Transform3D(translation=pose.position, quaternion=(x, y, z, w)))
+    stream.log(f"world/trails/{pose.robot}", rr.Points3D([pose.position], radii=TRAIL_M))
+    variances, axes = np.linalg.eigh(pose.covariance_matrix[3:6, 3:6])
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] = -axes[:, 0]
+    qw, *qxyz = wxyz_from_rotation(axes)
+    ellipsoid = rr.Ellipsoids3D(
+        centers=[pose.position],
+        half_sizes=[2 * np.sqrt(np.maximum(variances, 0.0))],
+        quaternions=[(*qxyz, qw)],
+    )
+    stream.log(f"world/uncertainty/{pose.robot}", ellipsoid)
+    stream.log(f"residual_px/{pose.robot}", rr.Scalars(pose.residual_px or 0.0))
 
 
 def _remove(path: Path) -> None:

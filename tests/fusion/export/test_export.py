@@ -3,6 +3,7 @@
 
 import csv
 import warnings
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,19 @@ import c3d
 import ezc3d
 import msgspec
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 from rosbags.highlevel import AnyReader
 
-from calib.rig.recording import RecordingWriter
+from calib.rig.camera import Camera
+from calib.rig.recording import RecordingWriter, read_messages
+from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import rotation_from_wxyz
+from camera_node.geometry.pose import Pose, rotation_from_wxyz
 from camera_node.protocol.messages import encode
 from fusion.commands.export import export
+from fusion.export import pose_formats
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import RobotPose, Robots
 from tests.fusion.bridges.foxglove_reader import read_mcap
@@ -77,6 +83,55 @@ def assert_points(label: str, points: np.ndarray, tolerance_mm: float) -> None:
         missing[border] = np.isnan(points[border]).all(axis=1)
     assert (np.isnan(points).any(axis=1) == missing).all()
     assert np.abs(points[~missing] - true_points_mm()[label][~missing]).max() < tolerance_mm
+
+
+def test_parquet_is_read_by_pyarrow_and_pandas(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """In several row groups, with each pose's own numbers; LeRobot's names of times."""
+    monkeypatch.setattr(pose_formats, "ROW_GROUP", 100)
+    out = tmp_path / "out.parquet"
+    assert export(recording, out) == 0
+    file = parquet.ParquetFile(out)
+    assert [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)] == [100, 100, 100, 60]
+    table, poses = file.read().to_pandas(), recorded_poses()
+    assert list(table.t_ns) == [pose.t_ns for pose in poses]
+    assert list(table.robot) == [pose.robot for pose in poses]
+    assert list(table.state) == [pose.state for pose in poses]
+    assert (table[["x", "y", "z"]].to_numpy() == [pose.position for pose in poses]).all()
+    assert (table[["qw", "qx", "qy", "qz"]].to_numpy() == [pose.quaternion_wxyz for pose in poses]).all()
+    covariances = np.stack(list(table.covariance)).reshape(-1, 12, 12)
+    assert (covariances == [pose.covariance_matrix for pose in poses]).all()
+    assert list(table.frame_index) == [k for k in range(N) for _ in BODIES]
+    assert (table.timestamp == (table.t_ns - START_NS) / 1e9).all()
+
+
+def test_rerun_reads_its_recording(recording: Path, tmp_path: Path):
+    """By Rerun's own reader: each pose that is not lost at its time, and the cameras."""
+    chunks = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed: pip install '.[rerun]'")
+    pose = Pose(position_m=(0.0, 0.0, 2.0), wxyz=(0.0, 1.0, 0.0, 0.0))
+    camera = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0, T_world_cam=pose)
+    rig = RigMessage(rig=Rig(cameras={"north": camera}), t_ns=START_NS)
+    with RecordingWriter(tmp_path / "both.mcap") as writer:
+        writer.put("x/rig", encode(rig), START_NS)
+        for key, data, t_ns in read_messages(recording, Counter()):
+            writer.put(key, data, t_ns)
+    out = tmp_path / "out.rrd"
+    assert export(tmp_path / "both.mcap", out) == 0
+    found: dict[str, dict[int, list[float]]] = {}
+    for chunk in chunks.RrdReader(str(out)).stream():
+        batch = chunk.to_record_batch()
+        if "Transform3D:translation" in batch.schema.names:
+            times = batch["capture"].cast("int64").to_pylist()
+            places = batch["Transform3D:translation"].to_pylist()
+            entity = found.setdefault(chunk.entity_path, {})
+            entity.update({t: place[0] for t, place in zip(times, places, strict=True) if place})
+    assert found["/world/cameras/north"] == {START_NS: [0, 0, 2]}
+    for robot in BODIES:
+        expected = {p.t_ns: p.position for p in recorded_poses() if p.robot == robot and p.state != "lost"}
+        rows = found[f"/world/robots/{robot}"]
+        assert rows.keys() == expected.keys()
+        np.testing.assert_allclose([rows[t] for t in expected], list(expected.values()), rtol=1e-6)
 
 
 def test_c3d_is_read_by_two_libraries(recording: Path, tmp_path: Path):
@@ -229,7 +284,11 @@ def test_a_recording_too_long_for_c3d_is_refused(tmp_path: Path):
     assert np.isfinite(points[:, 0]).all()
 
 
-@pytest.mark.parametrize(("package", "out"), [("ezc3d", "out.c3d"), ("rosbags", "bag")])
+@pytest.mark.parametrize(
+    ("package", "out"),
+    [("ezc3d", "out.c3d"), ("rosbags", "bag"), ("pyarrow", "out.parquet"), ("rerun", "out.rrd")],
+)
 def test_without_its_library_one_line_says_what_to_install(recording: Path, package: str, out: str):
     advice = advice_without(package, "fusion", "export", str(recording), str(recording.with_name(out)))
-    assert "pip install 'roundel[export]'" in advice
+    extra = {"pyarrow": "parquet", "rerun": "rerun"}.get(package, "export")
+    assert f"pip install 'roundel[{extra}]'" in advice

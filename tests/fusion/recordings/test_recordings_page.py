@@ -37,6 +37,8 @@ def test_the_sample_is_processed_cut_and_exported(tmp_path: Path):
         "part.csv",
         "part-rover.tum",
         "part.c3d",
+        "sample.png",
+        "apart.png",
     }
     (program,) = programs("recordings.md")
     words = [sys.executable, "-c", program]
