@@ -17,6 +17,7 @@ from tests.benchmarks.detector import (
     cameras,
     known_lens,
     lighting,
+    models,
     motion,
     negatives,
     pose,
@@ -38,6 +39,7 @@ PARTS = {
     "lighting": lighting.measure,
     "bent": bent.measure,
     "second": measurement.measure,
+    "models": models.measure,
 }
 
 
@@ -59,6 +61,7 @@ class Benchmark:
                 "lighting",
                 "bent",
                 "second",
+                "models",
                 "all",
             ],
             ...,

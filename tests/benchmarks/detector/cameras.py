@@ -8,6 +8,7 @@ frames of the camera and then forgot their roundels. Goals hold for the mild cam
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from rich.console import Console
@@ -29,6 +30,16 @@ PRINTS = (0.3, 0.5, 0.7)  # inner ratios that no detector is given
 PRINT_FOUND = 0.97
 SIZES = ((14, 20), (20, 32), (32, 60))  # pixels
 Light = Callable[[np.random.Generator], tuple[Array, list[Card]]]
+
+
+class Camera(Protocol):
+    """What makes a picture of light."""
+
+    def expose(self, light: Array, rng: np.random.Generator) -> Grey:
+        """The picture (h, w), uint8, of light (h, w) in linear levels of 255."""
+        ...
+
+
 Disturb = Callable[[Array, list[Card], np.random.Generator], Array]
 GROUNDS = ("even", "clutter")  # around the cards
 
@@ -105,7 +116,7 @@ MISSING: dict[str, Callable[[int], Iterator[Grey]]] = {
 }
 
 
-def share_found(known: Detector, sensor: Sensor, light: Light, frames: int) -> float:
+def share_found(known: Detector, sensor: Camera, light: Light, frames: int) -> float:
     """The share of the cards of so many pictures that is found in the first frame of each."""
     there = lost = 0
     for seed in range(frames):
@@ -116,14 +127,15 @@ def share_found(known: Detector, sensor: Sensor, light: Light, frames: int) -> f
     return 1 - lost / there
 
 
-def share_of_print(run: Run, sensor: Sensor, ratio: float, frames: int) -> float:
-    """The share of the cards of an unknown print that a new detector finds in the second frame of each picture."""
+def share_of_print(run: Run, sensor: Camera, ratio: float, frames: int, frame: int = 2) -> float:
+    """The share of the cards of an unknown print that a new detector finds in this frame of each picture."""
     there = lost = 0
     for seed in range(frames):
         rng = np.random.default_rng(seed)
         shown = [replace(card, ratio=ratio) for card in cards(rng)]
         light, detector = paste(ground("clutter", rng), shown), run.make()
-        detector.detect(sensor.expose(light, rng))
+        for _ in range(frame - 1):
+            detector.detect(sensor.expose(light, rng))
         found = detector.detect(sensor.expose(light, rng))
         there, lost = there + len(shown), lost + missed(shown, found.uv)
     return 1 - lost / there
@@ -149,7 +161,7 @@ class Errors:
 
 def errors(
     known: Detector,
-    sensor: Sensor,
+    sensor: Camera,
     band: tuple[int, int],
     frames: int,
     disturb: Disturb | None = None,
@@ -174,7 +186,7 @@ def errors(
         for card in shown:
             off = np.linalg.norm(found.uv - card.uv, axis=1)
             if off.min(initial=np.inf) < 0.2 * card.diameter:
-                rows.append(_errors(found[int(off.argmin())], sight_of(card, (SIZE[1], SIZE[0]))))
+                rows.append(errors_of(found[int(off.argmin())], sight_of(card, (SIZE[1], SIZE[0]))))
     if len(rows) < 2:
         return Errors(len(rows) / there, *[np.nan] * 4)
     centre, size, bias = np.array(rows).T
@@ -182,7 +194,7 @@ def errors(
     return Errors(len(rows) / there, centre.mean(), size.mean(), bias.mean(), sigma)
 
 
-def _errors(found: Roundel, sight: Sight) -> tuple[float, float, float]:
+def errors_of(found: Roundel, sight: Sight) -> tuple[float, float, float]:
     """Squared errors of centre and size over their variances, and the relative error of the size."""
     assert found.pose_cov is not None
     centre, axes = ellipse_of(sight)

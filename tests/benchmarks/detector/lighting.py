@@ -37,13 +37,13 @@ def soft_shadow(light: Array, cards: list[Card], rng: np.random.Generator) -> Ar
     return out
 
 
-def gloss(light: Array, cards: list[Card], rng: np.random.Generator) -> Array:
-    """A highlight on each card, which adds the same light to ink and paper."""
+def gloss(light: Array, cards: list[Card], rng: np.random.Generator, level: float = GLOSS) -> Array:
+    """A highlight on each card, which adds the same light to ink and paper, up to this grey level."""
     out = light.copy()
     for card, x, y in _surroundings(light, cards):
         u, v = rng.uniform(-0.5, 0.5, 2) * card.diameter
         squared = ((x - u) ** 2 + (y - v) ** 2) / (HIGHLIGHT * card.diameter) ** 2
-        out[_box(light, card)] += GLOSS * np.exp(-squared / 2)
+        out[_box(light, card)] += level * np.exp(-squared / 2)
     return out
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs without roundels: shared photographs, frames of shared videos, and the images of scikit-image."""
+"""Photographs without roundels: shared ones, frames of shared videos, and those that installed packages contain."""
 
-import importlib
+import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,8 +11,16 @@ import numpy as np
 from camera_node.sources.recorded_frames import read_grey
 from tests.benchmarks.detector.pictures import Grey
 
-SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
-LENGTH = 960  # pixels: images of scikit-image are scaled to this length and to half of it
+ABOVE = [folder / "shared" / "data" for folder in Path(__file__).resolve().parents[4:]]
+SHARED = next((folder for folder in ABOVE if folder.exists()), ABOVE[0])
+LENGTH = 960  # pixels: images of packages are scaled to this length and to half of it
+PACKAGES = {  # folders of photographs in installed packages
+    "skimage": "data/*",
+    "gtsam": "Data/Balbianello/*.jpg",
+    "matplotlib": "mpl-data/sample_data/grace_hopper.jpg",
+    "viser": "_assets/hdri/*.jpg",
+}
+DRAWN = ("color.png", "phantom.png", "logo.png", "horse.png", "chessboard_GRAY.png", "chessboard_RGB.png")
 
 
 def photographs(n: int) -> Iterator[Grey]:
@@ -28,16 +36,15 @@ def photographs(n: int) -> Iterator[Grey]:
 
 
 def _shipped() -> Iterator[Grey]:
-    try:
-        folder = Path(str(importlib.import_module("skimage.data").__file__)).parent
-    except ImportError:
-        return
-    drawn = ("color.png", "phantom.png", "logo.png", "horse.png", "chessboard_GRAY.png", "chessboard_RGB.png")
-    for path in sorted(folder.iterdir()):
-        if path.suffix in (".png", ".jpg", ".jpeg", ".tif") and path.name not in drawn:
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            if image is not None:
-                yield image.astype(np.uint8)
+    for package, pattern in PACKAGES.items():
+        found = importlib.util.find_spec(package)
+        if found is None or found.origin is None:
+            continue
+        for path in sorted(Path(found.origin).parent.glob(pattern)):
+            if path.suffix in (".png", ".jpg", ".jpeg", ".tif") and path.name not in DRAWN:
+                image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+                if image is not None:
+                    yield image.astype(np.uint8)
 
 
 def _scaled(image: Grey, length: int) -> Grey:

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One picture is enough, and what a detector has learned never makes a result worse than a fresh detector's.
+
+Each case is a disturbance that one picture shows, or that a detector's memory contradicts. Fresh detectors see a single
+picture; streams are compared with a fresh detector for each frame.
+"""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+
+import av
+import numpy as np
+from rich.console import Console
+
+from camera_node.detection.detector import Detector
+from camera_node.foundation.arrays import Array, Grey
+from camera_node.simulation.sensor import CLEAN, HARSH, MILD, Sensor
+from tests.benchmarks.detector.bent import measure_bend
+from tests.benchmarks.detector.cameras import (
+    Camera,
+    acquainted,
+    cards,
+    covered,
+    errors,
+    errors_of,
+    over_exposed,
+    share_found,
+    share_of_print,
+)
+from tests.benchmarks.detector.lighting import BAND, NOISE, Disturb, even, gloss, soft_shadow
+from tests.benchmarks.detector.photographs import photographs
+from tests.benchmarks.detector.pictures import Card, flat, missed, paste, sight_of
+from tests.benchmarks.detector.recall import SIZE, ground, occlude
+from tests.benchmarks.detector.second import camera as second
+from tests.benchmarks.detector.speed import walk
+from tests.benchmarks.detector.table import Run, Verdict
+
+GAMMA = Sensor(tone="gamma")
+LONE, POSTER = 0.5, 14  # ratio of the lone print, and prints of another ratio beside it
+STREAM = 8  # frames
+FAINT = (47, 88)  # encoded levels of ink and paper
+SHARPENED: dict[str, Camera] = {
+    "sharpened": Sensor(noise=1.0, sharpen=2.5),
+    "filmic and sharpened": second.Camera(colour=True, tone="filmic", jpeg=75),
+}
+PRINT_CLAIM = 1.5
+PRINTS = {
+    **{f"{ratio}": (ratio,) for ratio in (0.59, 0.61, 0.42)},
+    "0.59 and 0.6": (0.59, 0.6),
+    **{f"0.6, 100 mm, dot gain of {gain} mm": ((60 - 2 * gain) / (100 + 2 * gain),) for gain in (0.2, 0.3)},
+}
+COVER, FLICKER, TURN = (
+    0.2,
+    0.6,
+    6,
+)  # shares of the diameter and of the light, frames until the markers turn back
+
+
+@dataclass(frozen=True)
+class Video:
+    """A camera that sends H.264: the last frame of a pan of two pixels a frame.
+
+    Attributes:
+        rate: bits per second at 30 frames per second.
+    """
+
+    rate: int
+
+    def expose(self, light: Array, rng: np.random.Generator) -> Grey:
+        """The decoded last frame (h, w), which is a P frame."""
+        file = io.BytesIO()
+        with av.open(file, "w", "mp4") as sent:
+            stream = sent.add_stream("libx264", 30)
+            stream.height, stream.width = light.shape
+            stream.pix_fmt, stream.bit_rate = "yuv420p", self.rate
+            for k in range(STREAM - 1, -1, -1):
+                picture = NOISE.expose(np.roll(light, 2 * k, axis=1), rng)
+                frame = av.VideoFrame.from_ndarray(np.stack([picture] * 3, axis=-1), "rgb24")
+                sent.mux(stream.encode(frame))
+            sent.mux(stream.encode())
+        with av.open(io.BytesIO(file.getvalue()), "r") as received:
+            *_, last = received.decode(video=0)
+            return np.asarray(last.to_ndarray(format="gray"), np.uint8)
+
+
+FIRST_ERRORS: dict[str, tuple[Camera, Disturb, float]] = {
+    "smoothing": (Sensor(noise=3.0, denoise_px=1.0), even, 3.0),
+    "soft shadow": (NOISE, soft_shadow, 3.0),
+    "gloss of 40": (NOISE, partial(gloss, level=40.0), 4.0),
+    "H.264 at 0.5 Mbit/s": (Video(500_000), even, 3.0),
+    "H.264 at 2 Mbit/s": (Video(2_000_000), even, 3.0),
+}
+
+
+def lone_print_found(run: Run, camera: Camera, others: float, frames: int, count: int) -> float:
+    """The share of lone prints that is found among others of this ratio, after so many frames of the others alone."""
+    lost = 0
+    for seed in range(count):
+        rng, detector = np.random.default_rng(seed), run.make()
+        first, *rest = (replace(card, ratio=others) for card in cards(rng)[: POSTER + 1])
+        lone, light = replace(first, ratio=LONE), paste(ground("clutter", rng), rest)
+        for _ in range(frames):
+            detector.detect(camera.expose(light, rng))
+        lost += missed([lone], detector.detect(camera.expose(paste(light, [lone]), rng)).uv)
+    return 1 - lost / count
+
+
+def faint_found(known: Detector, count: int) -> float:
+    """The share of faint cards that a detector finds behind a tone curve of 2.2."""
+    ink, paper = 255 * (np.array(FAINT) / 255) ** 2.2
+
+    def faint(rng: np.random.Generator) -> tuple[Array, list[Card]]:
+        shown = cards(rng)[:POSTER]
+        return paste(flat(SIZE, 0.6 * paper), shown, dark=float(ink), bright=float(paper)), shown
+
+    return share_found(known, Sensor(noise=0.3, tone="gamma"), faint, count)
+
+
+def print_claims(run: Run, ratios: tuple[float, ...], count: int) -> Array:
+    """Mean squared errors of the size over the claim, one for each ratio, after a stream of prints of all of them."""
+    squared: list[list[float]] = [[] for _ in ratios]
+    for seed in range(count):
+        rng, detector = np.random.default_rng((3, seed)), run.make()
+        shown = [replace(card, ratio=ratios[k % len(ratios)]) for k, card in enumerate(cards(rng, 24, 60))]
+        light = paste(flat(SIZE, 90.0), shown)
+        for _ in range(STREAM - 1):
+            detector.detect(CLEAN.expose(light, rng))
+        found = detector.detect(CLEAN.expose(light, rng))
+        for k, card in enumerate(shown):
+            apart = np.linalg.norm(found.uv - card.uv, axis=1)
+            if apart.min(initial=np.inf) < 0.2 * card.diameter:
+                sight = sight_of(card, (SIZE[1], SIZE[0]))
+                squared[k % len(ratios)].append(errors_of(found[int(apart.argmin())], sight)[1])
+    return np.array([np.mean(values) if values else np.nan for values in squared])
+
+
+def disturbed_video(rng: np.random.Generator) -> Iterator[tuple[Grey, list[Card]]]:
+    """Markers that move and turn back behind a mild camera in flickering light, every third one covered."""
+    clutter, there = ground("clutter", rng), cards(rng)
+    steps = walk(there, TURN)
+    for k, shown in enumerate([*steps, *steps[-2:0:-1]] * 2):
+        light = paste(clutter, shown)
+        for n, card in enumerate(shown[::3]):
+            occlude(light, card, COVER, 0.8, np.random.default_rng(n))
+        light *= 1 - FLICKER / 2 * (1 + np.sin(2.4 * k))
+        yield MILD.expose(light, rng), shown
+
+
+def stream_and_fresh(run: Run, count: int) -> tuple[float, float]:
+    """The shares of the markers of disturbed videos that one detector finds, and that fresh ones for each frame do."""
+    there = streamed = fresh = 0
+    for seed in range(count):
+        detector = run.make()
+        for picture, shown in disturbed_video(np.random.default_rng((4, seed))):
+            there += len(shown)
+            streamed += missed(shown, detector.detect(picture).uv)
+            fresh += missed(shown, run.make().detect(picture).uv)
+    return 1 - streamed / there, 1 - fresh / there
+
+
+def false_detections(run: Run, count: int) -> tuple[int, int]:
+    """Roundels found by fresh detectors in photographs without any, and the number of photographs."""
+    found = [len(run.make().detect(picture)) for picture in photographs(count)]
+    return sum(found), len(found)
+
+
+def measure(run: Run, console: Console) -> list[Verdict]:
+    """Return the verdicts on all cases."""
+    frames = 20 if run.thorough else 4
+    return [
+        *_first_frame(run, frames),
+        *_learned(run, frames),
+        *_bent(run, 100 if run.thorough else 12),
+        _judge_stream(*stream_and_fresh(run, 10 if run.thorough else 2)),
+        _judge_false(*false_detections(run, 4000 if run.thorough else 400)),
+    ]
+
+
+def _first_frame(run: Run, frames: int) -> Iterator[Verdict]:
+    bars = partial(covered, COVER, False)
+    for what, sensor, goal in (
+        ("JPEG 80", Sensor(noise=1.5, jpeg=80), 0.9),
+        ("gamma 2.2", GAMMA, 0.9),
+        ("mild camera", MILD, 0.85),
+        ("harsh camera", HARSH, 0.6),
+    ):
+        yield _judge(f"20 % covered, {what}", share_found(run.make(), sensor, bars, frames), goal)
+    saturated = partial(over_exposed, 410.0)
+    for what, sensor in (("clean", CLEAN), ("mild", MILD)):
+        found = share_found(run.make(), sensor, saturated, frames)
+        yield _judge(f"paper at 410 of 255, {what} camera", found, 0.97)
+    for ratio in (0.3, 0.5, 0.7):
+        yield _judge(f"unknown print of {ratio}", share_of_print(run, MILD, ratio, frames, 1), 0.95)
+    for what, (camera, disturb, goal) in FIRST_ERRORS.items():
+        e = errors(run.make(), camera, BAND, frames, disturb)
+        yield _judge_claim(f"{what}, centre, {100 * e.found:.0f} % found", e.centre, goal)
+        yield _judge_claim(f"{what}, size", e.size, goal)
+
+
+def _learned(run: Run, frames: int) -> Iterator[Verdict]:
+    for (what, camera), others, before in product(
+        {"clean": CLEAN, "mild": MILD}.items(), (0.4, 0.6), (0, STREAM)
+    ):
+        found = lone_print_found(run, camera, others, before, 6 * frames)
+        when = f"appears after {before} frames" if before else "first frame"
+        yield _judge(f"print of {LONE} among {POSTER} of {others}, {what} camera, {when}", found, 0.99)
+    for what, detector in (("fresh", run.make()), ("after learning", acquainted(run, GAMMA))):
+        yield _judge(f"ink {FAINT[0]}, paper {FAINT[1]}, gamma 2.2, {what}", faint_found(detector, frames), 1)
+    for what, ratios in PRINTS.items():
+        for ratio, claim in zip(ratios, print_claims(run, ratios, frames), strict=True):
+            beside = f", those of {ratio}" if len(ratios) > 1 else ""
+            yield _judge_claim(f"size of prints of {what}{beside}", float(claim), PRINT_CLAIM)
+    for (what, camera), ratio in product(SHARPENED.items(), (0.3, 0.5, 0.7)):
+        found = share_of_print(run, camera, ratio, frames)
+        yield _judge(f"unknown print of {ratio}, {what}, second frame", found, 0.97)
+
+
+def _bent(run: Run, count: int) -> Iterator[Verdict]:
+    for bend in (0.03, 0.05):
+        for diameter in (80, 160, 300):
+            e = measure_bend(run, bend, diameter, count)
+            what = (
+                f"bent by {100 * bend:g} %, {diameter} px, centre {e.centre:.1f} size {e.size:.1f} of claim"
+            )
+            yield _judge(what, e.found, 0.9)
+
+
+def _judge(what: str, share: float, goal: float) -> Verdict:
+    return Verdict(what, f"{100 * share:.0f} %", f">= {100 * goal:g} %", share >= goal)
+
+
+def _judge_claim(what: str, squared: float, goal: float) -> Verdict:
+    return Verdict(f"squared error over claim: {what}", f"{squared:.1f}", f"<= {goal:g}", squared <= goal)
+
+
+def _judge_stream(streamed: float, fresh: float) -> Verdict:
+    return Verdict(
+        "all disturbances, stream against fresh detectors",
+        f"{100 * streamed:.1f} against {100 * fresh:.1f} %",
+        "never below",
+        streamed >= fresh,
+    )
+
+
+def _judge_false(found: int, pictures: int) -> Verdict:
+    return Verdict(
+        f"false detections, {pictures} photographs", str(found), "1 in 1,000", found <= pictures / 1000
+    )
