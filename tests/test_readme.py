@@ -73,6 +73,17 @@ def test_every_command_has_a_test():
     assert [command for command in OWN if not command.startswith(tested)] == []
 
 
+def test_the_program_of_the_readme_reads_the_arena_of_roundel_up(folder: Path):
+    """A copy of it gets poses of a user's own first arena."""
+    (code,) = PYTHON.findall(README)
+    up = Program(
+        words(f"roundel up lab --source --headless --local --listen tcp/127.0.0.1:{free_port()}"), folder
+    )
+    (name,) = re.findall(r"server of arena '(.*)' at", up.until("^server of arena"))
+    assert up.stop(signal.SIGTERM) == 0
+    assert f'arena="{name}"' in code
+
+
 def test_the_readme_is_short():
     """At most 700 words, with one picture, which is in the repository."""
     assert len(README.split()) <= 700
@@ -241,7 +252,8 @@ def run_demo_with_clients(folder: Path, scene: Path) -> tuple[int, str, str]:
     """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     (code,) = PYTHON.findall(README)
-    (folder / "follow.py").write_text(code.replace("tcp/localhost:7447", endpoint))
+    code = code.replace("tcp/localhost:7447", endpoint).replace('arena="arena"', 'arena="demo"')
+    (folder / "follow.py").write_text(code)
     command = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "12"]
     ros2 = words(f"roundel ros2 --connect {endpoint} --arena demo")
     with contextlib.ExitStack() as stack:

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from camera_node.protocol.presence import NO_SERVER, no_such_arena
 from fusion.protocol.pose_messages import FusionStatus
 from web.state.feed import ArenaState
 from web.tables import STALE_S, camera_silence_s, describe_silence, tabulate_cameras, tabulate_robots
@@ -78,9 +79,8 @@ def _server_faults(state: ArenaState, endpoint: str) -> Iterator[Condition]:
     elif state.server_alive and state.status is None:
         yield Condition("wait", "connected; waiting for the server's first status")
     elif state.status is None:
-        yield Condition(
-            "bad", f"no server at {endpoint}: start roundel server, and check --connect and --arena"
-        )
+        cause = no_such_arena(state.arena, state.other_arenas) if state.other_arenas else NO_SERVER
+        yield Condition("bad", f"no server at {endpoint}: {cause}")
     else:
         yield Condition("bad", f"the server is silent for {age_s:.0f} s: check that it runs at {endpoint}")
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import Detections, Keys, MessageError, Settings, decode, encode
+from camera_node.protocol.presence import SILENT, why_no_camera
 from camera_node.protocol.registration import (
     CameraChange,
     RegisteredCamera,
@@ -43,7 +44,9 @@ def request_settings(
     """
     payload = encode(wanted) if wanted is not None else b""
     try:
-        return decode(_ask(session, Keys(arena).settings(camera), payload, camera, timeout_s), Settings)
+        return decode(
+            _ask(session, arena, camera, Keys(arena).settings(camera), payload, timeout_s), Settings
+        )
     except MessageError as error:
         raise NetworkError(f"the reply of camera {camera} has no settings: {error}") from None
 
@@ -63,7 +66,7 @@ def request_snapshot(
         timeout_s: longest time that the camera may take.
     """
     key = Keys(arena).snapshot(camera) + (f"?{drawn}" if drawn else "")
-    return _ask(session, key, b"", camera, timeout_s)
+    return _ask(session, arena, camera, key, b"", timeout_s)
 
 
 def next_detections(
@@ -153,10 +156,11 @@ def _around(uv: Array, radius: float) -> Polygon:
     return tuple((round(float(u), 1), round(float(v), 1)) for u, v in corners)
 
 
-def _ask(session: zenoh.Session, key: str, payload: bytes, camera: str, timeout_s: float) -> bytes:
+def _ask(
+    session: zenoh.Session, arena: str, camera: str, key: str, payload: bytes, timeout_s: float
+) -> bytes:
     try:
         return send_request(session, key, payload, timeout_s)
     except NetworkError:
-        raise NetworkError(
-            f"no camera '{camera}' answers within {timeout_s:g} s; check its name, and that its program runs"
-        ) from None
+        cause = why_no_camera(session, Keys(arena).camera_alive(), camera) or SILENT
+        raise NetworkError(f"camera '{camera}' does not answer within {timeout_s:g} s; {cause}") from None

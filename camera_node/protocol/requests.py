@@ -17,6 +17,7 @@ import zenoh
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.protocol.messages import decode, encode
+from camera_node.protocol.presence import SILENT, why_no_server
 from camera_node.protocol.session import ask_server
 
 log = logging.getLogger("camera_node.requests")
@@ -91,10 +92,8 @@ def send_request(
         if reply := ask_server(session, key, max(left, answer_s), payload, sender(session)):
             return content_of(reply)
         time.sleep(min(RETRY_S, left))  # a session that was just opened knows no queryable yet
-    raise NetworkError(
-        f"no server answers on {key} within {timeout_s:g} s; check that roundel server runs there, and check "
-        "--connect and --arena"
-    )
+    cause = why_no_server(session, key.partition("/")[0]) or SILENT
+    raise NetworkError(f"no server answers on {key} within {timeout_s:g} s; {cause}")
 
 
 def content_of(reply: zenoh.Reply) -> bytes:

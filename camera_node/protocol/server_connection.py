@@ -17,6 +17,7 @@ from zenoh import Session  # in a class with a field `zenoh`
 
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import ConfigError, NetworkError
+from camera_node.protocol.presence import ALIVE
 from camera_node.protocol.session import NO_SERVER, PATIENCE_S, guarded, open_client, open_endless
 
 log = logging.getLogger("camera_node.network")
@@ -26,7 +27,6 @@ WAIT_S = 0.2  # between two looks at whether a session is open
 SCOUT_S = 1.5  # scouting repeats its question after 1 s
 CONNECT_S = 2.0  # to one router that was found
 MAX_ROUTERS = 16
-ALIVE = "*/fusion/alive"
 
 
 class ServerConnection:

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 
 from camera_node.protocol.server_connection import Connection
 from fusion.client.arena import Arena
-from fusion.client.streams import cause_of_silence
 from fusion.protocol.pose_messages import RobotPose
 
 log = logging.getLogger("fusion.bridge")
@@ -74,7 +73,7 @@ class PoseQueue:
             self._received_s, self._is_silent = now_s, False
         elif not self._is_silent and now_s - self._received_s >= SILENCE_S:
             self._is_silent = True
-            cause = cause_of_silence(self.client.connection, self.client.keys.arena, self._robot)
+            cause = self.client.why_no_poses(self._robot)
             log.warning("no pose %s within %g s; %s", self.client.origin, SILENCE_S, cause)
 
     def _put(self, poses: Sequence[RobotPose]) -> None:

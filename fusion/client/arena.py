@@ -29,16 +29,19 @@ from calib.rig.rig_messages import RigHistory, RigMessage
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, RelativePositions, decode
+from camera_node.protocol.presence import Presence, no_such
 from camera_node.protocol.requests import RETRY_S, RequestSource
 from camera_node.protocol.server_connection import LOCAL_SERVER, ServerConnection
 from camera_node.protocol.session import ask_server, guarded
-from fusion.client.streams import RelativeStream, RobotStream, Stream
+from fusion.client.streams import RobotStream, Stream
 from fusion.model.robots import Robot as RobotBody
+from fusion.protocol.arena_health import why_no_frames, why_no_markers, why_no_poses
 from fusion.protocol.pose_messages import FusionStatus, Markers, RobotPose, RobotPoses, Robots, RobotsRequest
 from fusion.protocol.robot_requests import change_robots, request_robots
 
 TIMEOUT_S = 10.0
 MAX_ROBOTS = 1024
+STATUS_S = 3.0  # a server sends its status every second
 
 
 class Arena:
@@ -59,8 +62,15 @@ class Arena:
         self._robots: dict[str, RobotStream] = {}
         self._streams: dict[str, Stream] = {}
         self._newest: dict[str, RobotPose] = {}
-        self._all: Stream[RobotPose] = Stream(f"poses {self._origin}", TIMEOUT_S)
-        self._sets: Stream[Sequence[RobotPose]] = Stream(f"poses {self._origin}", TIMEOUT_S)
+        self._presence = Presence(arena, self.keys.camera_alive())
+        connection.when_open(self._presence.watch)
+        self._server_status: tuple[float, FusionStatus] | None = None  # when it arrived
+        poses, cause = f"poses {self._origin}", self.why_no_poses
+        self._all: Stream[RobotPose] = Stream(poses, TIMEOUT_S, cause)
+        self._sets: Stream[Sequence[RobotPose]] = Stream(poses, TIMEOUT_S, cause)
+        self._subscribe(
+            self.keys.fusion_status, guarded("status", self._taker(FusionStatus, self._keep_status))
+        )
         if robot == "*":
             self._subscribe(self.keys.poses, guarded("poses", self._taker(RobotPoses, self._deliver_all)))
         else:
@@ -105,7 +115,8 @@ class Arena:
         """The poses of a robot; iterating waits at most `timeout_s` for the next one (None: for ever)."""
         with self._lock:
             if name not in self._robots:
-                stream = RobotStream(name, self._origin, timeout_s, self._newest.keys())
+                content = f"pose of '{name}' {self._origin}"
+                stream = RobotStream(content, timeout_s, lambda: self.why_no_poses(name))
                 self._robots[name] = stream
                 if name in self._newest:
                     stream._put(self._newest[name])
@@ -125,6 +136,25 @@ class Arena:
         """
         self._sets.timeout_s = timeout_s
         return self._sets
+
+    def why_no_poses(self, robot: str | None = None) -> str:
+        """The cause why no pose arrives, of a robot or of any, in one sentence with what to do. It asks nobody.
+
+        The server is away, the arena has another name, no camera sends frames, none is calibrated, the robot is not
+        declared or not seen; it names the arenas and robots that are there.
+        """
+        return self._why(lambda status: why_no_poses(status, robot))
+
+    def _why(self, of_status: Callable[[FusionStatus], str]) -> str:
+        """Why the server does not answer, or what its status says."""
+        if cause := self._presence.why_no_server():
+            return cause
+        received_s, status = self._server_status or (0.0, None)
+        if status is None or time.monotonic() - received_s > STATUS_S:
+            return "the server runs, but its status has not arrived: it has just started, or it is overloaded"
+        return (
+            of_status(status) or "the server sends it now: wait longer, or check the network and the rights"
+        )
 
     def robots(self) -> tuple[str, ...]:
         """Names of the robots whose poses were received so far."""
@@ -194,15 +224,25 @@ class Arena:
 
     def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
         """All markers of every frame set."""
-        return self._stream(self.keys.markers, Markers, "markers", timeout_s)
+        return self._stream(
+            self.keys.markers, Markers, "markers", timeout_s, lambda: self._why(why_no_markers)
+        )
 
     def status(self, timeout_s: float | None = TIMEOUT_S) -> Stream[FusionStatus]:
         """The server's status, once a second."""
-        return self._stream(self.keys.fusion_status, FusionStatus, "status", timeout_s)
+        return self._stream(
+            self.keys.fusion_status, FusionStatus, "status", timeout_s, lambda: self._why(lambda _: "")
+        )
 
     def camera_statuses(self, timeout_s: float | None = TIMEOUT_S) -> Stream[CameraStatus]:
         """The status of each camera, once a second."""
-        return self._stream(self.keys.camera_status(), CameraStatus, "camera status", timeout_s)
+        return self._stream(
+            self.keys.camera_status(),
+            CameraStatus,
+            "camera status",
+            timeout_s,
+            lambda: self._why(why_no_frames),
+        )
 
     def relative(self, camera: str, timeout_s: float | None = TIMEOUT_S) -> Stream[RelativePositions]:
         """The roundels that a camera locates relative to itself, every frame; `unpack` gives arrays. Needs no server.
@@ -212,7 +252,8 @@ class Arena:
         """
         key = self.keys.relative(require_name(camera, "a camera"))
         if key not in self._streams:
-            stream = self._streams[key] = RelativeStream(f"positions of '{camera}' {self._origin}", timeout_s)
+            content = f"positions of '{camera}' {self._origin}"
+            stream = self._streams[key] = Stream(content, timeout_s, lambda: self._why_not_located(camera))
 
             def put(message: RelativePositions) -> None:
                 if message.camera == camera:
@@ -240,7 +281,7 @@ class Arena:
             if data is not None or is_reached:
                 return None if data is None else self._read_rig(data)
             time.sleep(min(RETRY_S, left))
-        raise NetworkError(f"no rig {self._origin} within {timeout_s:g} s; is roundel server running there?")
+        raise NetworkError(f"no rig {self._origin} within {timeout_s:g} s; {self._why(lambda _: '')}")
 
     def _read_rig(self, data: bytes) -> Rig | None:
         try:
@@ -249,9 +290,22 @@ class Arena:
             self.faults["RigMessage"] += 1
             return None
 
-    def _stream(self, key: str, kind: type, content: str, timeout_s: float | None) -> Stream:
+    def _why_not_located(self, camera: str) -> str:
+        cameras = self._presence.cameras  # this needs no server
+        if cameras and camera not in cameras:
+            return no_such("camera", camera, cameras)
+        command = "roundel camera --rig RIG --diameter METRES"
+        return (
+            f"does it run with these options: {command}?"
+            if cameras
+            else f"no camera runs there: start {command}"
+        )
+
+    def _stream(
+        self, key: str, kind: type, content: str, timeout_s: float | None, cause: Callable[[], str]
+    ) -> Stream:
         if key not in self._streams:
-            stream = self._streams[key] = Stream(f"{content} {self._origin}", timeout_s)
+            stream = self._streams[key] = Stream(f"{content} {self._origin}", timeout_s, cause)
             take = guarded(content, self._taker(kind, stream._put))
             self._subscribe(key, take)
         self._streams[key].timeout_s = timeout_s
@@ -279,6 +333,9 @@ class Arena:
                 self.faults["RobotPose"] += 1
 
         self._taker(RobotPose, deliver)(sample)
+
+    def _keep_status(self, status: FusionStatus) -> None:
+        self._server_status = time.monotonic(), status
 
     def _deliver_all(self, message: RobotPoses) -> None:
         self._deliver(message.poses)

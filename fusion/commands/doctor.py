@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 import tyro
 
-from camera_node.foundation.errors import RoundelError
+from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.foundation.terminal import say
 from fusion.client.arena import Arena
 from fusion.diagnosis.findings import (
@@ -24,8 +24,6 @@ from fusion.diagnosis.findings import (
     observe,
 )
 from fusion.server.arena_config import ArenaConfig, load_arena
-
-START = "start it with roundel server --config arena.yaml, or give its address with --connect"
 
 
 def doctor(
@@ -75,7 +73,10 @@ def _findings(
             yield Finding("error", "configuration", str(error))
             return
     endpoints = connect or tuple(e.replace("0.0.0.0", "127.0.0.1") for e in config.listen)
-    observation = _observe(endpoints, arena or config.arena, zenoh_config, timeout_s)
+    try:
+        observation, absence = _observe(endpoints, arena or config.arena, zenoh_config, timeout_s), ""
+    except NetworkError as error:
+        observation, absence = None, str(error)
     if path is not None:
         server_config = Path(config.zenoh) if config.zenoh else None
         yield from check_listening(config, observation is not None)
@@ -86,7 +87,7 @@ def _findings(
         yield from check_certificates(zenoh_config, now)
         yield check_disk(Path())
     if observation is None:
-        yield Finding("warning", "server", f"no server answers at {' '.join(endpoints)}", START)
+        yield Finding("warning", "server", absence)
         return
     yield Finding("ok", "server", f"answers at {' '.join(endpoints)}")
     yield from check_arena(observation, now)
@@ -94,6 +95,6 @@ def _findings(
 
 def _observe(
     endpoints: tuple[str, ...], arena: str, zenoh_config: Path | None, timeout_s: float
-) -> Observation | None:
+) -> Observation:
     with Arena.connect(*endpoints, arena=arena, zenoh_config=zenoh_config) as client:
         return observe(client, timeout_s)

@@ -20,7 +20,7 @@ import msgspec
 import zenoh
 
 from calib.rig.rig import Rig, load_rig
-from camera_node.foundation.errors import NetworkError, RoundelError
+from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.messages import CameraStatus
 from fusion.client.arena import Arena
 from fusion.model.robots import load_robots
@@ -192,8 +192,8 @@ class Observation:
     rig: Rig | None
 
 
-def observe(arena: Arena, timeout_s: float) -> Observation | None:
-    """Receive the statuses of the server and the cameras; None where no server answers within `timeout_s`."""
+def observe(arena: Arena, timeout_s: float) -> Observation:
+    """Receive the statuses of the server and the cameras. Raises NetworkError, with the cause, if none arrive."""
     cameras: dict[str, CameraStatus] = {}
 
     def keep(status: CameraStatus) -> None:
@@ -202,13 +202,10 @@ def observe(arena: Arena, timeout_s: float) -> Observation | None:
 
     arena.camera_statuses().on_message(keep)
     end_s = time.monotonic() + LISTEN_S
-    try:
+    status = arena.status(timeout_s).next()
+    while time.monotonic() < end_s:
         status = arena.status(timeout_s).next()
-        while time.monotonic() < end_s:
-            status = arena.status(timeout_s).next()
-        return Observation(status, cameras, arena.rig(timeout_s))
-    except NetworkError:
-        return None
+    return Observation(status, cameras, arena.rig(timeout_s))
 
 
 def check_arena(observation: Observation, now: datetime) -> Iterator[Finding]:

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 
 from calib.rig.rig import Rig
+from camera_node.protocol.presence import MAX_NAMED, NO_CAMERA, listed, no_such
 from fusion.protocol.pose_messages import CameraHealth, FusionStatus
 
 MAX_CALIBRATION_DAYS = 90
@@ -119,6 +120,47 @@ def calibration_problems(calibration: Calibration) -> list[str]:
     if (calibration.age_days or 0.0) > MAX_CALIBRATION_DAYS:
         problems.append(f"the calibration is {calibration.age_days:.0f} days old; repeat it")
     return problems
+
+
+def why_no_frames(status: FusionStatus) -> str:
+    """Why no frames arrive at the server, and what to do; empty if some do."""
+    if any(camera.fps > 0 for camera in status.cameras.values()):
+        return ""
+    if status.cameras:
+        return f"no camera sends frames ({listed(status.cameras)}): check their programs and cables"
+    return NO_CAMERA
+
+
+def why_no_markers(status: FusionStatus) -> str:
+    """Why the server locates nothing, and what to do; empty if it can."""
+    sending = {name: camera for name, camera in status.cameras.items() if camera.fps > 0}
+    if not any(camera.calibrated for camera in sending.values()):
+        return why_no_frames(status) or (
+            f"no camera that sends frames is calibrated ({listed(sending)}): run roundel calibrate wand --live"
+        )
+    return ""
+
+
+def why_no_poses(status: FusionStatus, robot: str | None = None) -> str:
+    """Why the server publishes no pose, of a robot or of any, and what to do; empty if it should."""
+    declared = {*status.robots, *status.not_acquired}
+    if robot is not None and declared and robot not in declared:
+        return no_such("robot", robot, declared)
+    if cause := why_no_markers(status):
+        return cause
+    if not declared:
+        return "no robot is declared: use roundel define, or the tab Robots of the page"
+    expected = sorted(declared) if robot is None else [robot]
+    if any(status.robots.get(name) == "tracked" for name in expected):
+        return ""
+    reasons = (f"robot {name} is {_describe_robot(status, name)}" for name in expected[:MAX_NAMED])
+    return f"the server runs and has frames, but {'; '.join(reasons)}"
+
+
+def _describe_robot(status: FusionStatus, robot: str) -> str:
+    state = status.robots.get(robot, "lost")
+    reason = status.not_acquired.get(robot, "are its markers in view of the cameras?")
+    return f"{'not found' if state == 'lost' else state}: {reason}"
 
 
 def describe_status(status: FusionStatus) -> str:

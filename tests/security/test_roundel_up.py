@@ -68,7 +68,7 @@ def test_all_programs_work_with_their_certificates(running: tuple[Program, Progr
             )
         assert "north" in roundel("cameras", "list", *member, folder=keys / "viewer")
         for name, answer in refused.items():
-            assert f"no camera '{name}' answers" in answer.result()
+            assert f"camera '{name}' does not answer" in answer.result()
         assert "error: " in unknown.result()
     assert camera.stop() == 0
     assert up.stop() == 0

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The status line names the worst fault and what to do; the next step follows the order of the work."""
 
+import re
 import time
 from dataclasses import replace
 
 import pytest
 
+from camera_node.protocol.server_connection import ServerConnection
 from fusion.protocol.pose_messages import FusionStatus
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.colours import own_colours, robot_colour
 from web.condition import CONNECT_S, Condition, assess, next_step
 from web.state.feed import ArenaState, Feed, TimedMessage
+from web.state.subscription import Subscription
 
 ENDPOINT = "tcp/lab:7447"
 
@@ -83,6 +86,24 @@ def test_the_absence_of_a_server_is_a_fault_after_a_while():
     late = assess(ArenaState(now_s=CONNECT_S + 1), ENDPOINT)
     assert late.level == "bad"
     assert ENDPOINT in late.text
+
+
+def test_the_name_of_another_arena_is_told(arena: LiveArena):
+    """A page that takes the name that the line proposes finds the server."""
+    token = arena.session.liveliness().declare_token(arena.keys.fusion_alive)
+    with ServerConnection([arena.endpoint]) as connection:
+        wrong = Feed("tset")
+        subscription = Subscription(connection, wrong)
+        wait_for(lambda: wrong.state().other_arenas)
+        state = wrong.state()
+        text = assess(replace(state, now_s=state.started_s + CONNECT_S + 1), ENDPOINT).text
+        subscription.close()
+        (named,) = re.findall(r"there is no arena 'tset', but test.*; give --arena (\w+)", text)
+        right = Feed(named)
+        subscription = Subscription(connection, right)
+        wait_for(lambda: right.state().server_alive)
+        subscription.close()
+    token.undeclare()
 
 
 def test_cameras_that_locate_by_themselves_need_no_server():

@@ -17,6 +17,7 @@ from camera_node.foundation.errors import TEMPORARY_FAILURE, USER_ERROR, ConfigE
 from camera_node.foundation.service import ServiceManager, stopped_by_signals
 from camera_node.foundation.supervisor import Supervisor
 from camera_node.foundation.terminal import say
+from camera_node.protocol.server_connection import LOCAL_SERVER
 from camera_node.sources.frame import SourceSettings
 from fusion.server.arena_config import ArenaConfig, load_arena
 from web.arena_folder import ArenaFolder
@@ -55,7 +56,7 @@ class RunArena:
     def run(self) -> int:
         """Run until stopped; return the exit code."""
         folder = ArenaFolder(self.folder)
-        is_new = folder.create(self.arena or "arena", self.listen, self.local)
+        is_new = folder.create(self.arena or LOCAL_SERVER.arena, self.listen, self.local)
         if not self.headless:
             check_port(self.host, self.port)
         config = load_arena(folder.config)

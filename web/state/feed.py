@@ -14,6 +14,7 @@ import msgspec
 
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigHistory, RigMessage
+from camera_node.foundation.config import is_name
 from camera_node.foundation.errors import printable
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.messages import (
@@ -79,6 +80,8 @@ class ArenaState:
     rig_t_ns: int | None = None  # since when it is in force, server's time
     history: RigHistory | None = None  # the versions of the server's rig
     server_alive: bool = False
+    arena: str = ""
+    other_arenas: frozenset[str] = frozenset()  # whose servers are reached
     message_counts: Counter[str] = field(default_factory=Counter)  # by kind; frames by "frames <camera>"
     faults: Counter[str] = field(default_factory=Counter)  # skipped messages, by reason
 
@@ -126,7 +129,7 @@ class Feed:
         self.keys = Keys(arena)
         self._on_pose, self._clock = on_pose, clock
         self._lock = threading.RLock()
-        self._state = ArenaState(started_s=clock())
+        self._state = ArenaState(started_s=clock(), arena=arena)
         self._received_s = 0.0  # of the message that is being stored
         self._pending: dict[str, PendingMessage] = {}  # by key
         self._covered_s: dict[str, float] = {}  # when each camera's coverage was extended last
@@ -190,10 +193,14 @@ class Feed:
             copies = {name: getattr(self._state, name).copy() for name in _CONTAINERS}
             return replace(self._state, now_s=self._clock(), **copies)
 
-    def set_server_alive(self, alive: bool) -> None:
-        """Store whether the server is running."""
+    def note_arena(self, arena: str, alive: bool) -> None:
+        """Store whether the server of an arena is running, of this one or of another that is reached."""
         with self._lock:
-            self._state.server_alive = alive
+            if arena == self.keys.arena:
+                self._state.server_alive = alive
+            elif is_name(arena) and len(self._state.other_arenas) < MAX_NAMES:
+                others = self._state.other_arenas
+                self._state.other_arenas = others | {arena} if alive else others - {arena}
 
     def store_history(self, history: RigHistory) -> None:
         """Store the versions of the rig, which the server sends on request."""
@@ -211,7 +218,11 @@ class Feed:
             old = self._state
             self._pending, self._covered_s = {}, {}
             self._state = ArenaState(
-                started_s=old.started_s, server_alive=old.server_alive, faults=old.faults
+                started_s=old.started_s,
+                server_alive=old.server_alive,
+                arena=old.arena,
+                other_arenas=old.other_arenas,
+                faults=old.faults,
             )
 
     def count_fault(self, reason: str, count: int = 1) -> None:

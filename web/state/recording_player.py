@@ -112,7 +112,7 @@ class RecordingPlayer:
 
     def run(self, feed: Feed, stop: threading.Event, once: bool = False) -> None:
         """Play into a feed until `stop` is set; with `once`, set it at the end of the recording."""
-        feed.set_server_alive(True)
+        feed.note_arena(feed.keys.arena, True)
         for reason, count in self.faults.items():
             feed.count_fault(reason, count)
         playback = self._start_pass(feed)

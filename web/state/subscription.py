@@ -15,6 +15,7 @@ from camera_node.foundation.errors import RoundelError
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.protocol.camera_requests import request_settings
 from camera_node.protocol.messages import MessageError, Settings, decode
+from camera_node.protocol.presence import ALIVE
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.server_connection import ServerConnection
 from camera_node.protocol.session import guarded
@@ -130,10 +131,10 @@ class Subscription:
             # The liveliness token may arrive before the rig's queryable exists, and a published rig may be dropped
             # under congestion: each status of another rig asks again.
             receive_status = guarded("a status", partial(self._request_new_rig, session))
-            receive_token = guarded("the server's token", partial(self._server_changed, session))
+            receive_token = guarded("a server's token", partial(self._server_changed, session))
             self._entities += [
                 session.declare_subscriber(keys.fusion_status, receive_status),
-                session.liveliness().declare_subscriber(keys.fusion_alive, receive_token, history=True),
+                session.liveliness().declare_subscriber(ALIVE, receive_token, history=True),
             ]
 
     def _follow_previews(self, session: zenoh.Session) -> None:
@@ -151,9 +152,9 @@ class Subscription:
         return session.declare_subscriber(key_expr, guarded("a message", receive))
 
     def _server_changed(self, session: zenoh.Session, sample: zenoh.Sample) -> None:
-        alive = sample.kind == zenoh.SampleKind.PUT
-        self.feed.set_server_alive(alive)
-        if alive:
+        alive, arena = sample.kind == zenoh.SampleKind.PUT, str(sample.key_expr).partition("/")[0]
+        self.feed.note_arena(arena, alive)
+        if alive and arena == self.feed.keys.arena:
             self._request_rig(session)
 
     def _request_new_rig(self, session: zenoh.Session, sample: zenoh.Sample) -> None:

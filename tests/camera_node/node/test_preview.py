@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Small pictures of a camera: sent only while someone watches, bounded in size and cost; and requests to a node."""
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -187,7 +188,13 @@ def test_a_snapshot_is_saved(network, node: Node, tmp_path: Path):
         SaveSnapshot(name="cam0", out=tmp_path / "no" / "x.jpg", connection=server).run()
 
 
-def test_an_absent_camera_is_named(network):
-    client = network.router()
-    with pytest.raises(NetworkError, match="no camera 'north' answers"):
-        request_settings(client, "arena", "north", timeout_s=0.2)
+def test_an_absent_camera_is_answered_with_those_that_run(network, node: Node):
+    """The name that the error proposes is a camera's."""
+    client = network.client()
+    wait_for(lambda: request_settings(client, "arena", "cam0"))
+    with pytest.raises(NetworkError, match="there is no camera 'cam9', but cam0; did you mean cam0") as error:
+        request_settings(client, "arena", "cam9", timeout_s=0.2)
+    proposed = re.findall(r"did you mean (\w+)\?", str(error.value))
+    assert request_settings(client, "arena", *proposed) == request_settings(client, "arena", "cam0")
+    with pytest.raises(NetworkError, match="a Zenoh router answers there, but no arena's server"):
+        request_settings(client, "lab", "cam9", timeout_s=0.2)

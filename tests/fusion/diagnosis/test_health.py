@@ -53,7 +53,7 @@ def test_without_a_server_health_is_2_and_doctor_says_what_to_do(tmp_path: Path)
     assert done.stderr.count("\n") == 1
     checked = run_program("fusion", "doctor", "--connect", nowhere, "--timeout-s", "0.5")
     assert checked.returncode == 1
-    assert "start it with roundel server" in checked.stdout
+    assert "start it with roundel up or roundel server" in checked.stdout
 
 
 def test_a_taken_port_and_an_absent_address_are_errors():

@@ -300,7 +300,10 @@ def test_a_viewer_that_missed_a_publication_requests_the_rig(tmp_path: Path):
 def test_without_a_server_a_request_fails(endpoint: str):
     with (
         open_router([endpoint]) as router,
-        pytest.raises(NetworkError, match=r"no server answers on test/rig/set within 0\.2 s"),
+        pytest.raises(
+            NetworkError,
+            match=r"no server answers on test/rig/set within 0\.2 s; no server answers there: start it",
+        ),
     ):
         set_rig(router, "test", GIVEN, "test", timeout_s=0.2)
 
