@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Maps the expected position error of points across the arena, in millimetres, and draws the map."""
+"""Maps of errors across the arena, in millimetres: the expected error of points, and the drawing of any such map."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ COLUMNS = 8  # of a map, about
 STEPS = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0)  # metres between grid points
 CELL = 46  # pixels of one grid cell
 MARGIN = 3 * CELL
+MIN_WIDTH = 560  # pixels of a map, for its title
 INK, PAPER = (40, 35, 30), (252, 252, 250)
 HIDDEN = (225, 225, 225)  # cells that fewer than two cameras see
 
@@ -39,6 +40,11 @@ class FloorGrid:
             for a, b in zip(low, high, strict=True)
         )
         return cls(x, y, z)
+
+    @property
+    def step(self) -> float:
+        """Metres between neighbours; 1 if there is one point only."""
+        return float(self.x[1] - self.x[0]) if len(self.x) > 1 else 1.0
 
     @property
     def points(self) -> Array:
@@ -84,15 +90,18 @@ class PrecisionMap:
 
     def lines(self) -> list[str]:
         """The map as text, north (y) up, with a dot where fewer than two cameras see."""
-        grid = self.grid
-        lines = [
-            f"expected error in mm at z = {grid.z:.2f} m (1 sigma, worst axis, centres to {self.sigma_px:g} px):"
-        ]
-        for row in reversed(range(len(grid.y))):
-            cells = "".join(f"{format_mm(value):>6}" for value in self.sigma_mm[row])
-            lines.append(f"{grid.y[row]:>7.2f} |{cells}")
-        lines.append(f"{'y / x':>7}  " + "".join(f"{x:>6.2f}" for x in grid.x))
-        return lines
+        height = f"z = {self.grid.z:.2f} m"
+        title = f"expected error in mm at {height} (1 sigma, worst axis, centres to {self.sigma_px:g} px):"
+        return [title, *error_rows(self.grid, self.sigma_mm)]
+
+
+def error_rows(grid: FloorGrid, errors_mm: Array) -> list[str]:
+    """Errors (Y, X) of a grid's points as lines of text, north (y) up, with a dot where an error is not finite."""
+    rows = [
+        f"{y:>7.2f} |" + "".join(f"{format_mm(value):>6}" for value in row)
+        for y, row in zip(grid.y, errors_mm, strict=True)
+    ]
+    return [*reversed(rows), f"{'y / x':>7}  " + "".join(f"{x:>6.2f}" for x in grid.x)]
 
 
 def format_mm(value: float) -> str:
@@ -130,21 +139,31 @@ def map_precision(
 
 def draw_precision(precision: PrecisionMap, cameras: Mapping[str, Camera]) -> NDArray[np.uint8]:
     """Draw the map as an image (h, w, 3) BGR, with placed cameras by name."""
-    rows, columns = precision.sigma_mm.shape
-    canvas = np.full((rows * CELL + 2 * MARGIN, columns * CELL + 2 * MARGIN, 3), PAPER, np.uint8)
-    _draw_cells(canvas, precision)
-    _draw_cameras(canvas, precision, cameras)
-    _draw_axes(canvas, precision)
     title = f"expected error, mm, at z = {precision.grid.z:.2f} m: {precision.typical_mm:.2f} in the median"
+    return draw_errors(precision.grid, precision.sigma_mm, title, cameras)
+
+
+def draw_errors(
+    grid: FloorGrid, errors_mm: Array, title: str, cameras: Mapping[str, Camera]
+) -> NDArray[np.uint8]:
+    """Draw errors (Y, X) of a grid's points, mm, as an image (h, w, 3) BGR, with placed cameras by name.
+
+    A point whose error is not finite is grey.
+    """
+    rows, columns = errors_mm.shape
+    size = rows * CELL + 2 * MARGIN, max(columns * CELL + 2 * MARGIN, MIN_WIDTH)
+    canvas = np.full((*size, 3), PAPER, np.uint8)
+    _draw_cells(canvas, errors_mm)
+    _draw_cameras(canvas, grid, cameras)
+    _draw_axes(canvas, grid)
     _draw_text(canvas, title, (8, 18))
     return canvas
 
 
-def _draw_cells(canvas: np.ndarray, precision: PrecisionMap) -> None:
-    sigma_mm = precision.sigma_mm
-    best = max(float(np.min(sigma_mm)), 1e-6) if np.isfinite(sigma_mm).any() else 1.0
-    for (row, column), value in np.ndenumerate(sigma_mm):
-        u, v = MARGIN + column * CELL, MARGIN + (len(sigma_mm) - 1 - row) * CELL
+def _draw_cells(canvas: np.ndarray, errors_mm: Array) -> None:
+    best = max(float(np.min(errors_mm)), 1e-6) if np.isfinite(errors_mm).any() else 1.0
+    for (row, column), value in np.ndenumerate(errors_mm):
+        u, v = MARGIN + column * CELL, MARGIN + (len(errors_mm) - 1 - row) * CELL
         share = min(np.log2(max(value / best, 1.0)) / 4, 1.0) if np.isfinite(value) else 1.0
         colour = (60 + 60 * share, 200 - 130 * share, 90 + 150 * share) if np.isfinite(value) else HIDDEN
         cv2.rectangle(canvas, (u, v), (u + CELL - 2, v + CELL - 2), colour, -1)
@@ -152,21 +171,19 @@ def _draw_cells(canvas: np.ndarray, precision: PrecisionMap) -> None:
             _draw_text(canvas, format_mm(value), (u + 5, v + CELL / 2 + 4))
 
 
-def _draw_cameras(canvas: np.ndarray, precision: PrecisionMap, cameras: Mapping[str, Camera]) -> None:
-    grid = precision.grid
-    step = grid.x[1] - grid.x[0] if len(grid.x) > 1 else 1.0
+def _draw_cameras(canvas: np.ndarray, grid: FloorGrid, cameras: Mapping[str, Camera]) -> None:
     for name, camera in cameras.items():
         position: Array = camera.matrix()[:2, 3]
-        u = MARGIN + ((position[0] - grid.x[0]) / step + 0.5) * CELL
-        v = MARGIN + (len(grid.y) - 0.5 - (position[1] - grid.y[0]) / step) * CELL
+        u = MARGIN + ((position[0] - grid.x[0]) / grid.step + 0.5) * CELL
+        v = MARGIN + (len(grid.y) - 0.5 - (position[1] - grid.y[0]) / grid.step) * CELL
         u, v = np.clip(u, 8, canvas.shape[1] - 8), np.clip(v, 36, canvas.shape[0] - 8)
         cv2.circle(canvas, (round(u), round(v)), 6, (200, 90, 20), -1, cv2.LINE_AA)
         fits_right = canvas.shape[1] - u > 9 * len(name) + 12
         _draw_text(canvas, name, (u + 9 if fits_right else u - 9 * len(name) - 6, v + 4))
 
 
-def _draw_axes(canvas: np.ndarray, precision: PrecisionMap) -> None:
-    grid, bottom = precision.grid, canvas.shape[0] - MARGIN
+def _draw_axes(canvas: np.ndarray, grid: FloorGrid) -> None:
+    bottom = canvas.shape[0] - MARGIN
     for column, x in enumerate(grid.x):
         _draw_text(canvas, f"{x:.2f}", (MARGIN + column * CELL + 5, bottom + 16))
     for row, y in enumerate(grid.y):

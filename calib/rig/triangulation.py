@@ -139,23 +139,41 @@ def point_covariances(
         (N, 3, 3) square metres; infinite where fewer than two cameras see the point, or their rays are parallel.
     """
     points = np.asarray(points, float).reshape(-1, 3)
-    A, views = np.zeros((len(points), 3, 3)), np.zeros(len(points), int)
     joint = joint or JointCovariance.of_poses(cameras)
-    d = len(joint.parameters)
-    G = np.zeros((len(points), 3, d * len(cameras)))
-    for k, camera in enumerate(cameras):
-        seen = sees(camera, points)
-        J, J_camera = _world_jacobians(camera, points[seen], joint.parameters)
-        A[seen] += np.swapaxes(J, 1, 2) @ J / sigma_px**2
-        G[seen, :, d * k : d * k + d] = np.swapaxes(J, 1, 2) @ J_camera / sigma_px**2
-        views[seen] += 1
-    spread = np.linalg.eigvalsh(A)
-    known = (views >= 2) & (spread[:, 0] > MIN_ANGLE**2 / 100 * spread[:, 2])
-    inverse = np.linalg.inv(A[known])
-    by_camera = inverse @ G[known]
+    seen = np.array([sees(camera, points) for camera in cameras], bool).reshape(len(cameras), len(points))
+    known, inverse, by_camera = point_derivatives(cameras, points, sigma_px, joint.parameters, seen)
     covariance = np.full((len(points), 3, 3), np.inf)
     covariance[known] = inverse + by_camera @ joint.covariance @ np.swapaxes(by_camera, 1, 2)
     return covariance
+
+
+def point_derivatives(
+    cameras: Sequence[Camera], points: Array, sigma_px: float, parameters: tuple[int, ...], seen: Mask
+) -> tuple[Mask, Array, Array]:
+    """How triangulated points depend on their pixels and on errors of the cameras; see `point_covariances`.
+
+    Args:
+        cameras: C placed cameras.
+        points: (N, 3) world, metres.
+        sigma_px: standard deviation of one pixel coordinate.
+        parameters: d parameters of each camera, numbered as in `calib.rig.camera`.
+        seen: (C, N) which cameras see each point.
+
+    Returns:
+        known: (N,) points that two cameras see, with rays that are not parallel; K of them.
+        covariance: (K, 3, 3) by pixel noise, square metres.
+        by_camera: (K, 3, C d) derivatives of these points by the cameras' parameters.
+    """
+    A, d = np.zeros((len(points), 3, 3)), len(parameters)
+    G = np.zeros((len(points), 3, d * len(cameras)))
+    for k, camera in enumerate(cameras):
+        J, J_camera = _world_jacobians(camera, points[seen[k]], parameters)
+        A[seen[k]] += np.swapaxes(J, 1, 2) @ J / sigma_px**2
+        G[seen[k], :, d * k : d * k + d] = np.swapaxes(J, 1, 2) @ J_camera / sigma_px**2
+    spread = np.linalg.eigvalsh(A)
+    known = (seen.sum(axis=0) >= 2) & (spread[:, 0] > MIN_ANGLE**2 / 100 * spread[:, 2])
+    inverse: Array = np.linalg.inv(A[known]).astype(float)
+    return known, inverse, inverse @ G[known]
 
 
 def _world_jacobians(camera: Camera, points: Array, parameters: tuple[int, ...]) -> tuple[Array, Array]:

@@ -58,6 +58,14 @@ COMMANDS = (
         "roundel redo",
     ),
     _command(
+        "Calibration",
+        "verify",
+        "verify a calibration by an object of known size",
+        "verify:Verify",
+        "roundel verify --object rod.yaml --live",
+        "roundel verify --object rod.yaml --recording rod.mcap --map rod.png",
+    ),
+    _command(
         "Robots",
         "define",
         "measure a new robot in the arena",

@@ -12,9 +12,7 @@ from fusion.recordings.offline_fusion import (
     OfflineArena,
     Summary,
     cameras_of,
-    fuse_frame_sets,
-    fuse_recording,
-    recorded_frame_sets,
+    fuse_again,
     robots_of,
     write_recording,
 )
@@ -48,12 +46,8 @@ def replay(
     cameras, declared = cameras_of(recorded, recording, rig), robots_of(recorded, recording, robots)
     arena = OfflineArena(cameras, declared, rate_hz, recorded.limits or Limits(), smooth)
     summary = Summary(faults=recorded.faults)
-    is_as_live = recorded.frame_sets and rig is None and rate_hz is None
-    if is_as_live:
-        results = fuse_frame_sets(recorded_frame_sets(recorded, cameras, summary.faults), arena, summary)
-    else:
-        results = fuse_recording(recorded.detections, arena, summary)
-    fused = track(results, "fusing")
+    is_anew = rig is not None or rate_hz is not None
+    fused = track(fuse_again(recorded, arena, summary, is_anew), "fusing")
     if out.suffix == ".mcap":
         write_recording(recording, out, fused)
     else:

@@ -127,6 +127,15 @@ def fuse_recording(
     yield from _fuse(_synchronize(messages, tracker, arena, summary.faults), tracker, arena, summary)
 
 
+def fuse_again(
+    recording: ArenaRecording, arena: OfflineArena, summary: Summary, anew: bool
+) -> Iterator[TrackingResult]:
+    """Fuse a recording: the server's frame sets, or those that are formed `anew` or because it holds none."""
+    if anew or not recording.frame_sets:
+        return fuse_recording(recording.detections, arena, summary)
+    return fuse_frame_sets(recorded_frame_sets(recording, arena.cameras, summary.faults), arena, summary)
+
+
 def fuse_frame_sets(
     frame_sets: Iterable[FrameSet], arena: OfflineArena, summary: Summary | None = None
 ) -> Iterator[TrackingResult]:
