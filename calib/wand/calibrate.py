@@ -45,7 +45,7 @@ from calib.wand.initial_rig import (
     explain_unplaced,
     find_faults,
 )
-from calib.wand.labels import label_recording
+from calib.wand.labels import explain_wand, label_recording
 from calib.wand.quality.checks import (
     check_clocks,
     check_lenses,
@@ -107,6 +107,23 @@ def calibrate(
     check_diameter(wand, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
+    try:
+        return _calibrate(rig, wand, messages, distance, synchronous, background)
+    except CalibrationError:
+        if difference := explain_wand(rig, wand, messages):
+            raise CalibrationError(difference) from None
+        raise
+
+
+def _calibrate(
+    rig: Rig,
+    wand: Body,
+    messages: Sequence[Detections],
+    distance: Distance | None,
+    synchronous: bool,
+    background: Sequence[Detections],
+) -> WandCalibration:
+    """Raises CalibrationError as `calibrate`, of a recording that fits the rig."""
     recording, timing = label_by_timing(rig, wand, messages, synchronous)
     start_ns = min(message.t_ns for message in messages)
     lenses = [rig.cameras[name] for name in recording.names]

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from calib.rig.rig import Rig
 from calib.wand.detections import FrameTable, Timing, WandDetections, WandRecording, build_tracks, gather
 from calib.wand.initial_rig import InitialRig, TwoViewGeometry, build_initial_rig, sampson
-from calib.wand.spacing import MAX_ROUNDELS, label_by_spacing, require_distinct
+from calib.wand.spacing import MAX_ROUNDELS, explain_spacing, label_by_spacing, require_distinct
 from calib.wand.trajectory import finite_velocities, hermite
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
@@ -77,6 +77,13 @@ def label_recording(
         middle_s=float(frames.t_s.min() + frames.t_s.max()) / 2,
         readout_s=frames.readout_s[last],
     )
+
+
+def explain_wand(rig: Rig, wand: Body, messages: Sequence[Detections]) -> str:
+    """How the wand of a recording differs from its file, as far as single images show it; empty if they do not."""
+    names = sorted({message.camera for message in messages})
+    lenses = [rig.cameras[name] for name in names]
+    return explain_spacing(wand, gather(messages, names, lenses)[1], lenses)
 
 
 def label(

@@ -26,6 +26,8 @@ MAX_SIGMAS = 4.0  # of a range or of the slant, in an accepted hypothesis
 SIGMA_LOG_SLANT = 0.2  # of the ratio of ranges along the wand; replaces the ranges where sizes are unknown
 MARGIN = 12.0  # least difference of the squared Mahalanobis distances of the best hypotheses of a frame
 SYMMETRY = 0.15  # relative difference of spacings below which they are not distinguished
+MIN_FRAMES = 20  # that state the spacing of a wand
+MAD_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 MAX_ROUNDELS = 40  # in a frame: the number of triples grows with the cube
 BATCH = 200_000  # triples that are evaluated at once
 
@@ -51,6 +53,67 @@ def require_distinct(wand: Body) -> None:
                 f"(distances {spacing}); move one so that the spacings differ by {SYMMETRY:.0%} or more, "
                 "or give observations with the column marker"
             )
+
+
+def explain_spacing(wand: Body, detections: WandDetections, lenses: Sequence[Lens]) -> str:
+    """How a straight wand of three differs from its file by its images, without the cameras' poses; empty if it fits.
+
+    With ends at the depths zA and zC, by the sizes of their discs, a middle that divides the image of the wand at the
+    share t divides the wand at t zA / (t zA + (1 - t) zC). The depths' errors have no preferred sign, so that the
+    median over many frames is precise, and what all sizes have in common cancels.
+    """
+    if len(wand.markers) != 3 or not is_collinear(wand.points) or (detections.label >= 0).any():
+        return ""
+    share, given = _middle_shares(detections, lenses, wand.diameter_m), _middle_share(wand)
+    if len(share) < MIN_FRAMES:
+        return ""
+    found = float(np.median(share))
+    sigma = MAD_SIGMA * float(np.median(np.abs(share - found))) / np.sqrt(len(share))
+    # Sizes may err by `SIGMA_LOG_RANGE` in all frames; the derivative of a share s by log zC is s (1 - s).
+    if abs(found - given) < found * (1 - found) * SIGMA_LOG_RANGE + MAX_SIGMAS * sigma:
+        return ""
+    length = float(np.ptp(_along(wand)))
+    short = given * length
+    return (
+        f"the wand differs from its file: {len(share)} images show its middle roundel {short:.3f} m from the nearer "
+        f"end and a length of {short / found:.3f} m, or {found * length:.3f} m and {length:.3f} m; the file has "
+        f"{short:.3f} m and {length:.3f} m. Measure the wand again, and correct its file"
+    )
+
+
+def _along(wand: Body) -> Array:
+    """(M,) the place of each marker along the wand's longest direction, metres, from its first marker."""
+    centred = wand.points - wand.points[0]
+    axis = centred[np.argmax(np.linalg.norm(centred, axis=1))]
+    return centred @ axis / np.linalg.norm(axis)
+
+
+def _middle_share(wand: Body) -> float:
+    """The distance of the middle marker from the nearer end, as a share of the wand's length."""
+    first, middle, last = np.sort(_along(wand))
+    return float(min(middle - first, last - middle) / (last - first))
+
+
+def _middle_shares(detections: WandDetections, lenses: Sequence[Lens], diameter_m: float) -> Array:
+    """(n,) the same from each frame with three roundels on a line, whose sizes are known."""
+    rows = np.flatnonzero((np.bincount(detections.frame) == 3)[detections.frame]).reshape(-1, 3)
+    xy, rays = detections.xy[rows], detections.rays()[rows]
+    z = ranges(lenses, detections, diameter_m)[rows] * rays[..., 2]
+    opposite = np.stack(
+        [np.linalg.norm(xy[:, (k + 1) % 3] - xy[:, (k + 2) % 3], axis=1) for k in range(3)], axis=1
+    )
+    middle = opposite.argmax(axis=1)  # opposite of the longest side
+    each = np.arange(len(rows))
+    a, b, c = (xy[each, (middle + k) % 3] for k in (1, 0, 2))
+    z_a, z_c = (z[each, (middle + k) % 3] for k in (1, 2))
+    chord = c - a
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-12)
+    focal = np.array([(lens.fx + lens.fy) / 2 for lens in lenses])[detections.camera[rows[:, 0]]]
+    off = np.abs(chord[:, 0] * (b - a)[:, 1] - chord[:, 1] * (b - a)[:, 0]) / length * focal
+    t = ((b - a) * chord).sum(axis=1) / length**2
+    share = t * z_a / (t * z_a + (1 - t) * z_c)
+    good = (off < GATE_PX) & np.isfinite(share) & (share > 0) & (share < 1)
+    return np.minimum(share, 1 - share)[good]
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +184,7 @@ class _PoseSearch:
         self.focal = np.array([(lens.fx + lens.fy) / 2 for lens in lenses])
         self.distance = ranges(lenses, detections, wand.diameter_m)
         self.rays = detections.rays()
-        centred = wand.points - wand.points[0]
-        axis = centred[np.argmax(np.linalg.norm(centred, axis=1))]
-        self.along = centred @ axis / np.linalg.norm(axis)
+        self.along = _along(wand)
 
     def hypotheses(self, rows: Index) -> _Hypotheses:
         """Return the accepted hypotheses in which three detections of a frame are three of the markers."""

@@ -71,6 +71,25 @@ def test_a_camera_that_is_not_placed_has_a_reason(change: Change, reason: str):
     assert list(result.rig.placed()) == ["cam0", "cam1", "cam2"]
 
 
+@pytest.mark.parametrize("sigma_px", [0.1, 0.4])
+@pytest.mark.parametrize("wrong", [(0.2, 0.55), (0.3, 0.55), (0.19, 0.55)])
+def test_a_wand_with_other_lengths_than_its_file_is_measured(wrong: tuple[float, float], sigma_px: float):
+    """The ratio is known from single images; a wand of the ratio that the error states is calibrated."""
+    arena, (middle, end) = ring(), wrong
+    messages = record(arena, 8.0, sigma_px=sigma_px)
+    false = Body(diameter_m=WAND.diameter_m, markers=((0.0, 0.0, 0.0), (middle, 0.0, 0.0), (end, 0.0, 0.0)))
+    with pytest.raises(CalibrationError, match="the wand differs from its file") as error:
+        calibrate(arena.intrinsics, false, messages)
+    ratio = re.search(r"([0-9.]+) m from the nearer end and a length of ([0-9.]+) m", str(error.value))
+    assert ratio is not None
+    share, true_share = float(ratio[1]) / float(ratio[2]), 0.2 / 0.5
+    assert share == pytest.approx(true_share, rel=0.015)  # 200 frames; each 5 % by the sizes' noise
+    stated = Body(
+        diameter_m=WAND.diameter_m, markers=((0.0, 0.0, 0.0), (share * 0.5, 0.0, 0.0), (0.5, 0.0, 0.0))
+    )
+    assert len(calibrate(arena.intrinsics, stated, messages).rig.placed()) == 4
+
+
 def swapped(cameras: int, first: str, second: str) -> Rig:
     """The intrinsics of a ring of cameras with those of two exchanged."""
     given = dict(ring(cameras).intrinsics.cameras)
