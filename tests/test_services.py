@@ -121,6 +121,7 @@ def test_a_server_that_is_stuck_reports_no_progress(tmp_path: Path, monkeypatch:
         (["fusion", "--listen", "nonsense"], USER_ERROR),
         (["fusion", "--config", "none.yaml"], USER_ERROR),
         (["camera_node", "--source", "/dev/video99", "--name", "north"], TEMPORARY_FAILURE),
+        (["camera_node", "--source", "nosuch", "--name", "north"], USER_ERROR),
         (["camera_node", "--source", "sim", "--scene", "none.yaml", "--name", "north"], USER_ERROR),
         (["web", "--host", "192.0.2.1"], TEMPORARY_FAILURE),
         (["web", "--port", "0"], USER_ERROR),

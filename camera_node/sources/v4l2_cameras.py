@@ -65,6 +65,8 @@ def find_device(text: str, sys: Path = SYS) -> Path:
         text: `2`, `/dev/video2`, or a name as in `<sys>/video2/name`.
         sys: the folder in which the kernel lists cameras.
 
+    A name that no camera has is an error; a number or a path may become right when a camera is plugged in.
+
     Raises:
         CameraError: no camera or several cameras have this name.
     """
@@ -80,7 +82,10 @@ def find_device(text: str, sys: Path = SYS) -> Path:
         raise CameraError(
             f"several cameras have the name '{text}'; give a path: {', '.join(map(str, matching))}"
         )
-    raise CameraAbsentError(f"no folder, video or camera '{without_credentials(text)}'; {present(names)}")
+    raise CameraError(
+        f"no folder, video or camera '{without_credentials(text)}'; {present(names)}. A camera that is plugged "
+        "in later needs its path: /dev/video0, or one of /dev/v4l/by-id"
+    )
 
 
 def camera_names(sys: Path = SYS) -> dict[Path, str]:

@@ -87,6 +87,17 @@ def test_a_camera_keeps_its_name_and_its_settings(start, tmp_path: Path):
     assert [path.name for path in stored.parent.glob("*.yaml")] == ["door.yaml"]
 
 
+def test_a_camera_with_a_wrong_name_is_not_started_again(start, tmp_path: Path):
+    """The error names what it needs; the rest of the arena runs."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    up = start("up", "lab", "--headless", "--listen", endpoint, "--source", "nosuch", "sim:north")
+    up.until("camera nosuch: needs a correction")
+    up.until("camera north publishes")
+    assert "no folder, video or camera 'nosuch'" in up.text
+    assert "starting it again" not in up.text
+    assert up.stop(signal.SIGTERM) == 0
+
+
 def test_a_server_that_can_not_start_ends_the_command(start, tmp_path: Path):
     """Exit code and error are the server's: a broken file needs a user."""
     (tmp_path / "lab").mkdir()
