@@ -145,9 +145,13 @@ def _camera_row(state: ArenaState, name: str, health: CameraHealth | None) -> Ta
 
 
 def camera_silence_s(state: ArenaState, name: str) -> float | None:
-    """For how long a camera has sent no status, seconds: infinite if it never did; None while it sends."""
-    age = state.age_s(state.cameras.get(name))
-    return age if age > STALE_S else None
+    """For how long a camera has sent no status, seconds: infinite if it never did; None while it sends.
+
+    None too for a camera that the server does not list: it was renamed or forgotten, and disappears.
+    """
+    age, status_age = state.age_s(state.cameras.get(name)), state.age_s(state.status)
+    is_listed = status_age > STALE_S or name in (state.status.message.cameras if state.status else {})
+    return age if age > STALE_S and is_listed else None
 
 
 def describe_silence(seconds: float) -> str:

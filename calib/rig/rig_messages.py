@@ -5,6 +5,7 @@ A change says what differs from the rig before, when it was made and by whom. A 
 its first line, so that a numbered version takes it along. Messages are encoded as in `camera_node.protocol.messages`.
 """
 
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -173,6 +174,11 @@ class RigVersion(RigChange, frozen=True, kw_only=True, omit_defaults=False):
     state: Literal["earlier", "in force", "undone"]
     file: Annotated[str, msgspec.Meta(max_length=255)] = ""  # empty if a restart loses it
 
+    def describe(self) -> str:
+        """What it changed, when, and who made it."""
+        made = datetime.fromtimestamp(self.t_ns / 1e9).isoformat(" ", "seconds")
+        return f"{self.change or 'unknown change'} ({made}, by {self.source or self.unnamed_maker})"
+
     @property
     def unnamed_maker(self) -> str:
         """Who made it, where `source` does not say so."""
@@ -185,6 +191,15 @@ class RigHistory(msgspec.Struct, frozen=True, kw_only=True):
     version: int = VERSION
     rig_t_ns: int | None = None  # `t_ns` of the `RigMessage` in force; None without a rig
     versions: Annotated[tuple[RigVersion, ...], msgspec.Meta(max_length=MAX_VERSIONS)] = ()
+
+    def next_undo(self) -> RigVersion | None:
+        """The version whose change an undo reverts: the one in force, if there is an earlier one."""
+        states = [version.state for version in self.versions]
+        return self.versions[states.index("in force")] if {"earlier", "in force"} <= set(states) else None
+
+    def next_redo(self) -> RigVersion | None:
+        """The version that a redo puts in force again."""
+        return next((version for version in self.versions if version.state == "undone"), None)
 
 
 def set_rig_key(arena: str) -> str:

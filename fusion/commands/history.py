@@ -55,7 +55,7 @@ def undo(
         connection: the arena's server.
     """
     with connection.open() as session:
-        say(_step(session, connection.arena, undo_rig, "previous"))
+        say(_step(session, connection.arena, undo_rig, "undone"))
     return 0
 
 
@@ -69,17 +69,19 @@ def redo(
         connection: the arena's server.
     """
     with connection.open() as session:
-        say(_step(session, connection.arena, redo_rig, "undone"))
+        say(_step(session, connection.arena, redo_rig, "redone"))
     return 0
 
 
 def _step(session: zenoh.Session, arena: str, step: Callable[..., RigMessage], word: str) -> str:
     """Change the server's rig; returns a sentence about the result."""
-    before = request_rig(session, arena)
+    before, history = request_rig(session, arena), request_rig_history(session, arena)
+    version = history.next_undo() if step is undo_rig else history.next_redo()
     after = step(session, arena, f"roundel {step.__name__.removesuffix('_rig')}").rig
     old = before.cameras if before else {}
     changed = [name for name in {**old, **after.cameras} if old.get(name) != after.cameras.get(name)]
-    text = f"the {word} rig is in force on the server; changed cameras: {', '.join(changed) or 'none'}"
+    what = printable(version.describe()) if version else "the last change"
+    text = f"{word} on the server: {what}; changed cameras: {', '.join(changed) or 'none'}"
     if step is undo_rig and before and (name := corrected_camera(before, after)):
         text += f"; {name} is no longer monitored"
     return text

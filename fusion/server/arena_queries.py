@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable
 from functools import partial
 
-import msgspec
 import zenoh
 
 from calib.rig.rig_messages import (
@@ -168,7 +167,7 @@ class CameraQueries:
         pipeline: its rig is changed with a camera's name.
         transport: receives the queries, and publishes assignments and the changed rig.
         clock: the server's time.
-        on_retired: called with the name of a camera that no camera has any more.
+        retire: called with a name that no camera has any more, or with one that a camera has again and False.
     """
 
     def __init__(
@@ -178,10 +177,10 @@ class CameraQueries:
         pipeline: TrackingPipeline,
         transport: Transport,
         clock: ServerClock | ClockSync,
-        on_retired: Callable[[str], object],
+        retire: Callable[[str, bool], object],
     ) -> None:
         self._keys, self._registry, self._pipeline = keys, registry, pipeline
-        self._on_retired = on_retired
+        self._retire = retire
         self._transport, self._clock = transport, clock
         self._shift_ns: int | None = None
 
@@ -214,7 +213,7 @@ class CameraQueries:
             self._rename_in_rig(before, request)
         after = self._registry.change(before, request)
         if request.forget or after != before:
-            self._on_retired(before)
+            self._retire(before, True)
         if not request.forget:
             assignment = self._assignment(after)
             key = assigned_key(self._keys.arena, assignment.id)
@@ -231,14 +230,13 @@ class CameraQueries:
             raise RequestError(
                 f"the rig has another camera with the name {request.name}; choose another name"
             )
-        cameras = {request.name if name == before else name: entry for name, entry in rig.cameras.items()}
-        renamed = msgspec.structs.replace(rig, cameras=cameras)
-        self._pipeline.replace_rig(renamed, self._clock.now_ns(), request.source)
+        self._pipeline.rename_camera(before, request.name, self._clock.now_ns(), request.source)
         if (message := self._pipeline.active_rig.message) is not None:
             self._transport.publish(self._keys.rig, message)
 
     def _assignment(self, name: str, shift_ns: int | None = None) -> CameraAssignment:
         camera = self._registry.cameras()[name]
+        self._retire(name, False)
         return CameraAssignment(
             id=camera.id,
             name=name,

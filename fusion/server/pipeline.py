@@ -21,7 +21,7 @@ from fusion.protocol.shards import Shard
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server_statistics import PipelineStatus
-from fusion.server.storage.active_rig import ActiveRig
+from fusion.server.storage.active_rig import ActiveRig, renamed
 from fusion.server.storage.active_robots import ActiveRobots
 from fusion.tracking.association import AssociatedFrames
 from fusion.tracking.tracker import Tracker
@@ -85,6 +85,14 @@ class TrackingPipeline:
             FusionError, ConfigError, CalibrationError: it can't be used or saved; the old one stays in force.
         """
         self._use(rig, lambda: self.active_rig.save(rig, now_ns, source))
+        self.active_rig.use(rig, now_ns, source)
+
+    def rename_camera(self, before: str, after: str, now_ns: int, source: RequestSource | None) -> None:
+        """Give a camera another name in all versions of the rig; raises as `replace_rig`."""
+        rig = self.active_rig.rig
+        assert rig is not None
+        rig = renamed(rig, before, after)
+        self._use(rig, lambda: self.active_rig.rename(before, after))
         self.active_rig.use(rig, now_ns, source)
 
     def undo_rig(self, now_ns: int, source: RequestSource | None = None) -> None:

@@ -58,9 +58,8 @@ class _CameraCounts:
 
     last_ns: int = 0
     is_gone: bool = False
-    is_retired: bool = (
-        False  # renamed or forgotten: not listed once its last frame under this name has passed
-    )
+    is_retired: bool = False  # renamed or forgotten: not listed, although its last frames may still arrive
+    taken_ns: int = 0  # when its newest frame was taken
     is_late: bool = False
     has_two_publishers: bool = False
     was_excluded: bool = False  # at some time since the last status
@@ -109,15 +108,17 @@ class ServerStatistics:
         if name not in self._cameras:
             log.info("camera %s appeared", name, extra=self._about(name))
         camera = self._cameras.setdefault(name, _CameraCounts())
-        if camera.is_gone:
+        if camera.is_gone and not camera.is_retired:
             log.info("camera %s is back", name, extra=self._about(name))
-        camera.is_gone, camera.last_ns = False, received_ns
+        # Only another camera with this name has a gap in the times of its frames, however late they arrive.
+        camera.is_retired &= t_ns - camera.taken_ns <= SILENT_S * 1e9
+        camera.is_gone, camera.last_ns, camera.taken_ns = False, received_ns, t_ns
         camera.lateness_ms.append((received_ns - t_ns) * 1e-6)
 
-    def retire(self, name: str) -> None:
-        """List a camera no more, once it is silent: it has another name, or was forgotten."""
+    def retire(self, name: str, is_retired: bool = True) -> None:
+        """List a camera no more, which has another name or was forgotten; or again, because a camera has this name."""
         if name in self._cameras:
-            self._cameras[name].is_retired = True
+            self._cameras[name].is_retired = is_retired
 
     def note_moved(self, name: str) -> None:
         """Log that a camera was moved and is excluded; the next status shows it, however soon it is used again."""
@@ -181,7 +182,9 @@ class ServerStatistics:
             cpu=(cpu_s - self._cpu_s) / seconds,
             memory_mb=memory_mb(),
             cameras={
-                name: _camera_health(name, self._cameras[name], seconds, pipeline) for name in self._cameras
+                name: _camera_health(name, camera, seconds, pipeline)
+                for name, camera in self._cameras.items()
+                if not camera.is_retired
             },
             robots=dict(self._robots),
             faults=faults,
@@ -208,12 +211,9 @@ class ServerStatistics:
     def _find_silent_cameras(self, now_ns: int) -> None:
         silent = {n: c for n, c in self._cameras.items() if now_ns - c.last_ns > SILENT_S * 1e9}
         for name, camera in silent.items():
-            if camera.is_retired:
-                with self._lock:
-                    del self._cameras[name]
-            elif not camera.is_gone:
+            if not (camera.is_gone or camera.is_retired):
                 log.warning("camera %s is gone: no frame for %.0f s", name, SILENT_S, extra=self._about(name))
-                camera.is_gone = True
+            camera.is_gone = True
 
     def _find_faulty_cameras(self) -> None:
         """Log the faults of a camera once when they begin."""

@@ -56,6 +56,15 @@ def test_a_silent_camera_is_red_and_comes_first(healthy: ArenaState):
     assert condition.text == "camera north silent for 4 s: check its cable and its program (and 1 more)"
 
 
+def test_a_camera_that_the_server_does_not_list_is_not_silent(healthy: ArenaState):
+    """It has another name from now on, and disappears; one whose name the server lists is red."""
+    status: FusionStatus = healthy.status.message  # pyright: ignore[reportOptionalMemberAccess]
+    renamed = with_silent(healthy, "north", 4.2)
+    assert assess(renamed, ENDPOINT).level == "bad"
+    del status.cameras["north"]
+    assert assess(renamed, ENDPOINT).level == "ok"
+
+
 def test_a_calibration_that_runs_comes_before_its_absence(healthy: ArenaState):
     """The line says what to do in it; a silent camera is worse."""
     uncalibrated = replace(healthy, rig=None)

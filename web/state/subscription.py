@@ -11,7 +11,8 @@ import msgspec
 import zenoh
 
 from calib.live.rig_requests import redo_rig, request_rig_history, request_rig_message, undo_rig
-from camera_node.foundation.errors import RoundelError
+from calib.rig.rig_messages import RigVersion
+from camera_node.foundation.errors import RoundelError, printable
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.protocol.camera_requests import request_settings
 from camera_node.protocol.messages import MessageError, Settings, decode
@@ -114,13 +115,15 @@ class Subscription:
             RequestError: the server refuses, as it does where there is none.
             NetworkError: it does not answer.
         """
+        history = self.feed.state().history
         undo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
-        return "the previous rig is in force on the server"
+        return _describe_step("undone", history.next_undo() if history else None)
 
     def redo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
         """Have the server redo the change of its rig that was undone last; returns and raises as `undo`."""
+        history = self.feed.state().history
         redo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
-        return "the undone rig is in force on the server again"
+        return _describe_step("redone", history.next_redo() if history else None)
 
     def _declare(self, session: zenoh.Session) -> None:
         keys = self.feed.keys
@@ -194,3 +197,7 @@ class Subscription:
 
         ask = guarded("a request for the robots", request)
         threading.Thread(target=ask, args=[self.feed.keys.arena], name="robots", daemon=True).start()
+
+
+def _describe_step(word: str, version: RigVersion | None) -> str:
+    return f"{word} on the server: {printable(version.describe()) if version else 'the last change'}"

@@ -28,6 +28,8 @@ HISTORY_COLUMNS = (
     Column("state", "", "undo restores the rig below the one in force, redo the one above"),
     Column("file", "", "on the server; none if a restart loses it"),
 )
+UNDO, REDO = "Undo the last change", "Redo"
+MAX_LABEL = 48  # characters of a change on a button
 LEVELS = {"earlier": "wait", "in force": "ok", "undone": "warn"}
 
 
@@ -67,17 +69,21 @@ class RigHistoryPanel:
         with gui.add_folder("History of the calibration"):
             self._table = gui.add_html(tabulate_history(None).html())
             answer = Answer(gui)
-            self._undo = ActionButton(gui, "Undo the last change", subscription.undo, answer)
-            self._redo = ActionButton(gui, "Redo", subscription.redo, answer)
+            self._undo = ActionButton(gui, UNDO, subscription.undo, answer)
+            self._redo = ActionButton(gui, REDO, subscription.redo, answer)
 
     def update(self, state: ArenaState) -> None:
         """Enable the buttons while there is something to restore."""
         if state.history is not self._shown:
             self._shown = state.history
             set_content(self._table, tabulate_history(state.history).html())
-        states = {version.state for version in state.history.versions} if state.history else set()
-        self._undo.show(enabled=state.server_alive and "earlier" in states)
-        self._redo.show(enabled=state.server_alive and "undone" in states)
+        history = state.history or RigHistory()
+        for button, label, version in (
+            (self._undo, UNDO, history.next_undo()),
+            (self._redo, REDO, history.next_redo()),
+        ):
+            what = f": {printable(version.change, MAX_LABEL)}" if version and version.change else ""
+            button.show(enabled=state.server_alive and version is not None, label=label + what)
 
 
 def tabulate_history(history: RigHistory | None) -> HtmlTable:

@@ -114,6 +114,24 @@ class ActiveRig:
         elif rig != self.rig:
             write_atomically(path, change + dump_rig(rig))
 
+    def rename(self, before: str, after: str) -> None:
+        """Give a camera another name in the saved rig and in all versions of its history.
+
+        A name is no calibration: an undo afterwards restores the poses before the last calibration, under the names of
+        today. A version that is broken keeps the old name, which is logged.
+
+        Raises:
+            ConfigError: the saved rig can't be written; nothing is changed.
+        """
+        self._save_active()
+        history = self._history
+        _rename_in_file(history.path, before, after)
+        for path in (*history.older(), *history.undone()):
+            try:
+                _rename_in_file(path, before, after)
+            except RoundelError as error:
+                log.warning("%s keeps the name %s of a camera that is now %s: %s", path, before, after, error)
+
     def _is_in_history(self) -> bool:
         """Whether undo or redo would restore the rig in use, which the saved file no longer holds."""
         files = [*self._history.older()[-1:], *self._history.undone()[-1:], self._history.path]
@@ -238,6 +256,22 @@ class ActiveRig:
             return
         yield self._saved
         yield from reversed(self._history.older())
+
+
+def renamed(rig: Rig, before: str, after: str) -> Rig:
+    """The rig with another name for a camera; another entry of that name, which no camera has, is left out."""
+    cameras = {
+        name: camera for name, camera in rig.cameras.items() if name != after or before not in rig.cameras
+    }
+    names = {name: after if name == before else name for name in cameras}
+    return msgspec.structs.replace(rig, cameras={names[name]: camera for name, camera in cameras.items()})
+
+
+def _rename_in_file(path: Path, before: str, after: str) -> None:
+    """Raises ConfigError or CalibrationError for a file that can't be read or written."""
+    rig, change = load_rig(path), read_change(path)
+    if before in rig.cameras:
+        write_atomically(path, change.line() + dump_rig(renamed(rig, before, after)))
 
 
 def is_newer(given: Path | None, saved: Path) -> bool:

@@ -66,7 +66,7 @@ def test_undo_returns_the_server_s_answer(arena: LiveArena, subscription: Subscr
     queryable = arena.session.declare_queryable(key, answer)
     wait_for(lambda: outcome(subscription) == "nothing to undo")
     granted[0] = True
-    assert "previous rig is in force" in subscription.undo(timeout_s=5.0)
+    assert "undone on the server: the last change" in subscription.undo(timeout_s=5.0)
     queryable.undeclare()
 
 
