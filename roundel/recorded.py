@@ -18,12 +18,14 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
 from camera_node.protocol.messages import Detections, MessageError, decode
 from camera_node.sources.recorded_detections import detect_frames, read_observations
+from fusion.export.plots import draw_recording, read_curves
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import RobotPose, Robots
 from fusion.recordings.arena_recording import ArenaRecording
 from fusion.recordings.recording_files import summarize_recording
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 Kind = Literal["poses", "detections"]
@@ -201,6 +203,18 @@ class Recording:
             elements = table[field].reshape(len(table), -1) if len(table) else np.empty((0, len(names)))
             columns |= {name: elements[:, k] for k, name in enumerate(names) if name is not None}
         return pandas.DataFrame(columns)
+
+    def plot(self, robots: str | Collection[str] | None = None) -> "Figure":
+        """Draw the trajectories, the positions with two standard deviations, and the residual of each camera
+        (`roundel plot`).
+
+        Args:
+            robots: a robot, or several; all unless given.
+
+        Raises:
+            ConfigError: matplotlib is not installed, or the recording has no poses of these robots.
+        """
+        return draw_recording(read_curves(self.path, sorted(_names(robots) or ())))
 
     @property
     def _is_folder(self) -> bool:

@@ -83,6 +83,13 @@ COMMANDS = (
     ),
     _command(
         "Recordings",
+        "sample",
+        "write the data of a small arena, to try the commands with",
+        "sample:sample",
+        "roundel sample",
+    ),
+    _command(
+        "Recordings",
         "record",
         "record a running arena",
         "record:record",

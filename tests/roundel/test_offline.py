@@ -147,7 +147,7 @@ def test_rendered_images_become_poses(tmp_path: Path):
 def test_the_poses_of_a_recorded_server_are_repeated(tmp_path: Path):
     """As `roundel replay` repeats them, byte for byte. Half a millimetre from what the server published: the sample's
     server was an earlier version."""
-    path = ROOT / "docs" / "sample.mcap"
+    path = ROOT / "configs" / "sample" / "recording.mcap"
     roundel("replay", str(path), "--out", "replayed.csv", folder=tmp_path)
     poses = list(track(path))
     write_csv(poses, tmp_path / "tracked.csv")

@@ -19,7 +19,7 @@ from fusion.recordings.arena_recording import read_recording
 from roundel import Recording
 from tests.conftest import ROOT
 
-SAMPLE = ROOT / "docs" / "sample.mcap"
+SAMPLE = ROOT / "configs" / "sample" / "recording.mcap"
 WAND = ROOT / "tests" / "data" / "wand"
 
 
@@ -169,7 +169,7 @@ def test_pandas_is_optional():
     code = (
         "import sys; sys.modules['pandas'] = None\n"
         "from roundel import Recording, RoundelError\n"
-        "try:\n    Recording('docs/sample.mcap').to_pandas()\n"
+        "try:\n    Recording('configs/sample/recording.mcap').to_pandas()\n"
         "except RoundelError as error:\n    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)

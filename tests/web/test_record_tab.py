@@ -108,7 +108,7 @@ def test_a_recording_is_made_shown_exported_renamed_and_deleted(view: View, tmp_
 
 def test_a_file_that_vanishes_hides_no_other(tmp_path: Path):
     """A recording that is removed while the folder is read, like a link to nothing, can't be examined."""
-    shutil.copy(ROOT / "docs" / "sample.mcap", tmp_path / "monday.mcap")
+    shutil.copy(ROOT / "configs" / "sample" / "recording.mcap", tmp_path / "monday.mcap")
     (tmp_path / "gone.mcap").symlink_to(tmp_path / "nothing")
     assert [summary.path.name for summary in list_recordings(tmp_path)] == ["monday.mcap"]
 
@@ -116,7 +116,7 @@ def test_a_file_that_vanishes_hides_no_other(tmp_path: Path):
 def test_recordings_are_listed_renamed_and_removed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A name that is taken, a path in the place of a name and a file that is no recording are refused."""
     for name in ("monday.mcap", "sunday.mcap", "rig.yaml"):
-        shutil.copy(ROOT / "docs" / "sample.mcap", tmp_path / name)
+        shutil.copy(ROOT / "configs" / "sample" / "recording.mcap", tmp_path / name)
     monday = str(tmp_path / "monday.mcap")
     recordings("list", (str(tmp_path),))
     assert re.search(

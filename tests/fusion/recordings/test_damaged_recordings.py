@@ -21,7 +21,7 @@ from tests.conftest import ROOT
 from tests.processes import run_program
 
 pytestmark = pytest.mark.computed
-SAMPLE = ROOT / "docs" / "sample.mcap"
+SAMPLE = ROOT / "configs" / "sample" / "recording.mcap"
 N_SAMPLE = 1502  # messages
 Entry = tuple[str, bytes, int]
 
