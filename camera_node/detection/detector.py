@@ -23,8 +23,7 @@ class DetectorSettings:
 
     Attributes:
         inner_ratios: inner over outer diameters of the prints in use. Without any, the detector finds them: rings of
-            0.26 to 0.74 count as roundels until three of one ratio are in a frame, then only those of that ratio and
-            the usual ones (0.6 and 0.41).
+            0.26 to 0.74 and 14 px count as roundels, and those of one ratio that recur teach it as that of a print.
         ratio_tolerance: largest difference between a measured ratio and that of a print.
         min_diameter_px, max_diameter_px: limits on the major axis of the outer ellipse.
         min_contrast: least difference of the bright and the dark level, grey levels. A lower value finds more in poor

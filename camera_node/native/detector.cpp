@@ -25,7 +25,6 @@ constexpr double kRingDepths[] = {0.3, 0.5};
 
 constexpr int kOverlap = 64;            // rows that a searched band shares with the one before
 constexpr int kSearchInterval = 16;     // frames in which all of the image is searched once
-constexpr int kExploreInterval = 128;   // frames in which it is searched for any print once
 constexpr double kMaxPartsShare = 0.5;  // of a frame: beyond it the whole frame is searched
 constexpr double kMinChange = 1 / 8.0;  // of the least contrast: change of a tile's mean
 // Noise alone spans 8 standard deviations in 10,000 pixels, and 9 in the widest tile of a frame.
@@ -35,25 +34,26 @@ constexpr double kNoiseSpan = 9.5;
 
 Detector::Detector(RoundelLimits limits, double search_share, bool by_paper)
     : limits_(std::move(limits)),
-      any_limits_(limits_),
       search_share_(search_share),
-      chords_(limits_, false),
+      chords_(limits_, limits_.any_print),
       matcher_(limits_) {
     if (by_paper) paper_.emplace();
     if (!limits_.any_print) return;
     print_ratios_.emplace();
-    limits_.prints = any_limits_.prints = print_ratios_->prints();
+    limits_.prints = print_ratios_->prints();
 }
 
-Detector::FrameState::FrameState(const ImageView& view, const RoundelLimits& those)
-    : image(view), limits(those), noise(noise_level(view)), suppression(view.width, view.height) {}
+Detector::FrameState::FrameState(const ImageView& given, const ImageView& linearized)
+    : encoded(given),
+      image(linearized),
+      noise(noise_level(linearized)),
+      suppression(given.width, given.height) {}
 
 FrameResult Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     // 1. Grey levels in proportion to light, as far as the response of this camera is known.
-    const ImageView linear = response_.linearize(image);
-    FrameState frame(linear, limits_of_frame());
+    FrameState frame(image, response_.linearize(image));
     // 2. The roundels of the last frame, at their predicted positions.
     const std::vector<ExpectedRoundel> lost = fit_tracked(frame);
     // 3. New ones: local thresholds and chords give seeds, rays from these a conic, the photometric fit the
@@ -83,27 +83,26 @@ FrameResult Detector::detect(const ImageView& image) {
     return {std::move(frame.found), n_postponed_};
 }
 
-/// The limits of the prints in use. The second frame and one in 128 thereafter are searched for any print,
-/// since twice the clutter looks like rings of any ratio as of two.
-const RoundelLimits& Detector::limits_of_frame() {
-    const bool any = print_ratios_ && explore_in_-- <= 0;
-    const RoundelLimits& limits = any ? any_limits_ : limits_;
-    chords_.set_limits(limits, any);
-    if (any) {
-        explore_in_ = kExploreInterval - 1;
-        n_frames_ = kSearchInterval;
-    }
-    return limits;
+/// Casts rays in the picture as the camera gives it, in which contrast is judged, and converts the levels.
+std::optional<InitialGuess> Detector::guess(const Seed& seed, const FrameState& frame) const {
+    auto guess = fit_rays(frame.encoded, seed, limits_);
+    if (!guess) return guess;
+    guess->dark = response_.linear(guess->dark);
+    guess->bright = response_.linear(guess->bright);
+    return guess;
 }
 
 /// Fits the roundels of the last frame: steady ones from their last model, others by rays from their
 /// predicted positions. Returns those that it does not find.
 std::vector<ExpectedRoundel> Detector::fit_tracked(FrameState& frame) const {
     std::vector<ExpectedRoundel> lost;
-    for (const ExpectedRoundel& expected : tracks_.expect())
-        if (!(expected.steady && fit_and_accept(expected.guess(), expected.track, frame)) &&
-            !fit_and_accept(fit_rays(frame.image, expected.seed, limits_), expected.track, frame))
-            lost.push_back(expected);
+    for (const ExpectedRoundel& expected : tracks_.expect()) {
+        if (expected.steady && fit_and_accept(expected.guess(), expected.track, frame)) continue;
+        Seed seed = expected.seed;
+        seed.dark = int(response_.encoded(seed.dark));
+        seed.bright = int(response_.encoded(seed.bright));
+        if (!fit_and_accept(guess(seed, frame), expected.track, frame)) lost.push_back(expected);
+    }
     return lost;
 }
 
@@ -115,13 +114,13 @@ std::vector<Box> Detector::parts_to_search(const FrameState& frame) {
         n_frames_ = 0;
     }
     ++n_frames_;
-    change_mask_.update(frame.image);
+    change_mask_.update(frame.encoded);
     for (const TrackedFit& roundel : frame.found) change_mask_.mask(roundel.fit.outer);
     auto parts =
         change_mask_.changed(kMinChange * limits_.min_contrast, std::min(kMaxPartsShare, search_share_));
     const double area = double(frame.image.width) * frame.image.height;
     const bool whole = parts.size() == 1 && parts[0].area() == area;
-    return whole ? std::vector{next_band(frame.image)} : parts;
+    return whole ? std::vector{next_band(frame.encoded)} : parts;
 }
 
 /// The rows that are searched if all of the image changed.
@@ -146,9 +145,11 @@ static double tile_contrast(double noise, const RoundelLimits& limits) {
 /// Searches the parts of the image for the chords of rings, and for the streaks of moving ones.
 Detector::Candidates Detector::find_candidates(const FrameState& frame, const std::vector<Box>& parts) {
     Candidates candidates;
+    const bool linear = response_.exponent_in_use() == 1;
+    const double noise = linear ? frame.noise : noise_level(frame.encoded);
     for (const Box& part : parts) {
-        const ImageView view = window(frame.image, part);
-        chords_.run(view, local_threshold(view, tile_contrast(frame.noise, limits_), 0));
+        const ImageView view = window(frame.encoded, part);
+        chords_.run(view, local_threshold(view, tile_contrast(noise, limits_), 0));
         const float left = float(part.left), top = float(part.top);
         for (Seed seed : chords_.seeds()) {
             seed.x += left;
@@ -173,7 +174,7 @@ int Detector::fit_seeds(const std::vector<Seed>& seeds, FrameState& frame) {
     for (; done < n && frame.n_fits < most; ++done) {
         const Seed& seed = seeds[(first + done) % n];
         if (frame.suppression.contains_fast(double(seed.x), double(seed.y))) continue;
-        fit_and_accept(fit_rays(frame.image, seed, frame.limits), -1, frame);
+        fit_and_accept(guess(seed, frame), -1, frame);
     }
     begin_at_ = done < n ? double((first + done) % n) / double(n) : 0;
     return int(n - done);
@@ -202,7 +203,7 @@ void Detector::fit_moving_tracked(std::vector<ExpectedRoundel> lost, FrameState&
         };
         if (std::any_of(frame.found.begin(), frame.found.end(), is_same)) continue;
         const KnownRoundel known{expected->fit, expected->vx, expected->vy};
-        accept(fit_known_moving(frame.image, known, context(frame)), expected->track, frame);
+        accept(fit_known_moving(frame.image, known, context(frame.noise)), expected->track, frame);
     }
 }
 
@@ -222,28 +223,24 @@ void Detector::fit_moving_streaks(const std::vector<Streak>& streaks, FrameState
         if (failures >= may_fail || fits == kMaxMovingFits) break;
         if (frame.suppression.contains(guess.still.outer.x, guess.still.outer.y)) continue;
         ++fits;
-        failures += !accept(fit_new_moving(frame.image, guess, context(frame)), -1, frame);
+        failures += !accept(fit_new_moving(frame.image, guess, context(frame.noise)), -1, frame);
     }
 }
 
 /// Whether the camera's response is all that shapes the levels of a roundel.
 static bool shows_camera(const RoundelFit& fit) { return fit.unoccluded && !fit.fields.has_light(); }
 
-/// Learns which prints are in use; once some are known, other rings no longer count as roundels.
+/// Learns which prints are in use. Rings of other ratios count as roundels all the same.
 void Detector::learn_prints(const FrameState& frame) {
     if (!print_ratios_) return;
     std::vector<PrintSample> samples;
     for (const TrackedFit& roundel : frame.found)
         if (shows_camera(roundel.fit)) samples.push_back({&roundel.fit, roundel.track});
-    for (const RoundelFit& fit : frame.unknown)
-        if (shows_camera(fit)) samples.push_back({&fit, -1});
     if (print_ratios_->learn(samples)) use_prints();
 }
 
 void Detector::use_prints() {
     limits_.prints = print_ratios_->prints();
-    limits_.any_print = !print_ratios_->decided();
-    any_limits_.prints = limits_.prints;
     matcher_.use_prints(limits_.prints);
 }
 
@@ -261,7 +258,7 @@ void Detector::learn_camera(const FrameState& frame) {
 void Detector::learn_response(const std::vector<const RoundelFit*>& clear) {
     const double exponent = response_.exponent_in_use();
     if (!response_.learn(clear, limits_)) return;
-    change_mask_.invalidate();
+    limits_.linearized_by = response_.exponent_in_use();
     tracks_.forget_models();
     light_.scale(response_.exponent_in_use() / exponent);
     if (print_ratios_) print_ratios_->forget_measurements();
@@ -290,7 +287,7 @@ bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int trac
     if (!guess) return false;
     if (frame.suppression.contains(guess->outer.x, guess->outer.y)) return true;
     ++frame.n_fits;
-    return accept(fit_roundel(frame.image, *guess, context(frame), track >= 0), track, frame);
+    return accept(fit_roundel(frame.image, *guess, context(frame.noise), track >= 0), track, frame);
 }
 
 bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const {
@@ -302,10 +299,6 @@ bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameStat
     if (std::any_of(depths.begin(), depths.end(),
                     [&](double depth) { return is_bullseye(frame.image, *fit, depth); }))
         return false;
-    if (!known && !limits_.any_print) {
-        frame.unknown.push_back(*fit);
-        return false;
-    }
     frame.suppression.add(fit->outer);
     frame.found.push_back({*fit, track});
     return true;
@@ -315,7 +308,7 @@ std::vector<RefusedRing> Detector::explain(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     const ImageView linear = response_.linearize(image);
-    return explain_refusals(linear, context(limits_, noise_level(linear)));
+    return explain_refusals(linear, context(noise_level(linear)));
 }
 
 std::optional<double> Detector::theta() const {
@@ -340,6 +333,7 @@ void Detector::take_over(Detector& from) {
     response_ = from.response_;
     bend_ = from.bend_;
     light_ = from.light_;
+    limits_.linearized_by = response_.exponent_in_use();
     if (print_ratios_ && from.print_ratios_) {
         print_ratios_ = from.print_ratios_;
         use_prints();

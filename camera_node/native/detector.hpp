@@ -53,13 +53,11 @@ class Detector {
   private:
     /// What is found in one frame.
     struct FrameState {
-        FrameState(const ImageView& view, const RoundelLimits& limits);
-        const ImageView& image;
-        const RoundelLimits& limits;  // of the prints that this frame is searched for
-        double noise;                 // grey levels
+        FrameState(const ImageView& given, const ImageView& linearized);
+        ImageView encoded, image;  // as the camera gives it, and with levels in proportion to light
+        double noise;              // of `image`, grey levels
         Suppression suppression;
         std::vector<TrackedFit> found;
-        std::vector<RoundelFit> unknown;  // of no print in use
         int n_fits = 0;
     };
     /// Places where roundels may be, in the image's frame.
@@ -68,7 +66,6 @@ class Detector {
         std::vector<Streak> streaks;
     };
 
-    const RoundelLimits& limits_of_frame();
     std::vector<ExpectedRoundel> fit_tracked(FrameState& frame) const;
     void fit_by_paper(FrameState& frame);
     std::vector<Box> parts_to_search(const FrameState& frame);
@@ -86,8 +83,9 @@ class Detector {
 
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
-    AcceptanceContext context(const RoundelLimits& limits, double noise) const {
-        return {limits,
+    std::optional<InitialGuess> guess(const Seed& seed, const FrameState& frame) const;
+    AcceptanceContext context(double noise) const {
+        return {limits_,
                 light_,
                 noise,
                 response_.edge_noise(),
@@ -95,9 +93,8 @@ class Detector {
                 response_.correlation(),
                 &response_.remainder()};
     }
-    AcceptanceContext context(const FrameState& frame) const { return context(frame.limits, frame.noise); }
 
-    RoundelLimits limits_, any_limits_;
+    RoundelLimits limits_;
     std::optional<PrintRatios> print_ratios_;  // if they were not given
     double search_share_;
     ChordSearch chords_;
@@ -112,7 +109,6 @@ class Detector {
     double begin_at_ = 0;     // share of the seeds at which the next frame begins
     int n_postponed_ = 0;     // in the last frame
     int n_frames_ = 0;        // since all of the image counted as changed
-    int explore_in_ = 1;      // frames until the next search for any print
     mutable std::mutex mutex_;
 };
 

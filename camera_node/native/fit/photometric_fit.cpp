@@ -81,6 +81,7 @@ constexpr double kMaxPlateauError = 3;   // standard deviations
 
 // 4. The print
 constexpr double kMaxPrintError = 3;  // standard deviations
+constexpr double kOtherPrint = 0.1;   // difference of ratios of another print, however uncertain the ratio is
 constexpr double kFirstOrder = 0.5;   // share of an expected curvature's effect that the first order may miss
 
 /// The fields that a fit contains or tests its residuals for.
@@ -563,6 +564,7 @@ void PhotometricFitter::use_print(const Print& print) {
     const auto saved = std::tuple(p_, factor_, sums_, noise_, scale_);
     const Parameters with = covariance_with_ratio();
     const double off = print.ratio + effect_of_curvature(tone_.expected)[kRatio] - p_[kRatio];
+    if (std::abs(off) > kOtherPrint) return;
     for (int i = 0; i < kCount; ++i) p_[i] += with[i] * off / with[kRatio];
     if (is_sane(kFitLimits)) {
         linearize(pixels_);

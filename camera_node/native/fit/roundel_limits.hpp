@@ -33,7 +33,8 @@ struct RoundelLimits {
     double ratio_tolerance = 0.08;
     double min_diameter = 8;    // major axis of the outer ellipse, pixels
     double max_diameter = 400;  // major axis of the outer ellipse, pixels
-    double min_contrast = 25;   // bright minus dark level, grey levels
+    double min_contrast = 25;   // bright minus dark level, grey levels of the camera
+    double linearized_by = 1;   // exponent that made the levels of fits from those of the camera
 
     // Prints that are not known in advance: least and greatest ratio, the tolerance of a measured one, and
     // the least diameter, pixels, at which it tells a print from a letter.
@@ -47,6 +48,14 @@ struct RoundelLimits {
         const double least = low->ratio - ratio_tolerance, most = high->ratio + ratio_tolerance;
         if (!any) return {least, most};
         return {std::min(least, kAnyPrint.first), std::max(most, kAnyPrint.second)};
+    }
+    /// The contrast of two levels of a fit as the camera shows it.
+    double contrast(double dark, double bright) const {
+        if (linearized_by == 1) return bright - dark;
+        const auto encoded = [&](double level) {
+            return 255 * std::pow(std::max(level, 0.0) / 255, 1 / linearized_by);
+        };
+        return encoded(bright) - encoded(dark);
     }
     /// The difference of a measured ratio from that of the nearest known print, beyond its uncertainty.
     double print_error(double measured) const {

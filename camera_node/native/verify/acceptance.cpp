@@ -98,7 +98,7 @@ bool passes(const ImageView& image, const RoundelFit& fit, const AcceptanceConte
 
 /// Whether ragged edges may be the reason that a fit was rejected.
 bool may_be_ragged(const RoundelFit& fit, const RoundelLimits& limits) {
-    return has_known_ratio(fit, limits) && fit.contrast() >= limits.min_contrast / 2 &&
+    return has_known_ratio(fit, limits) && limits.contrast(fit.dark, fit.bright) >= limits.min_contrast / 2 &&
            fit.support >= kRaggedSupport;
 }
 
@@ -196,7 +196,7 @@ bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits) {
 std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits) {
     if (!has_known_ratio(fit, limits) && !limits.may_be_print(fit.ratio, fit.outer.major))
         return Refusal::kRatio;
-    if (fit.contrast() < limits.min_contrast) return Refusal::kContrast;
+    if (limits.contrast(fit.dark, fit.bright) < limits.min_contrast) return Refusal::kContrast;
     const double brightest = 255 + (fit.clipped ? kOverflow : kUnderflow);
     if (fit.dark <= -kUnderflow || fit.bright >= brightest) return Refusal::kLevels;
     const double major = fit.outer.major;

@@ -101,13 +101,9 @@ std::optional<CameraResponse::ToneMeasurement> CameraResponse::measure(const Rou
     const double here = exponent(curvature);
     const double middle = fit.dark + (0.5 + curvature / 4) * fit.contrast();
     const double exact = std::hypot(sigma, kSecondOrder * square(curvature));
+    const auto share = [&](double level) { return EncodedLevel(encoded(level) / 255); };
     return ToneMeasurement{{log_exponent_ + here, std::abs(exponent(curvature + sigma) - here)},
-                           {encoded(fit.dark), encoded(middle), encoded(fit.bright), exact}};
-}
-
-/// A level of the linearized image, as the camera encoded it.
-EncodedLevel CameraResponse::encoded(double level) const {
-    return EncodedLevel(std::pow(std::max(level, 0.0) / 255, std::exp(-log_exponent_)));
+                           {share(fit.dark), share(middle), share(fit.bright), exact}};
 }
 
 /// What the tone curve leaves beside the power, if the power does not describe it.
@@ -184,8 +180,7 @@ bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
 
 void CameraResponse::set_exponent(double log_exponent) {
     log_exponent_ = log_exponent;
-    for (int level = 0; level < 256; ++level)
-        linear_[size_t(level)] = uint8_t(std::lround(255 * std::pow(level / 255.0, std::exp(log_exponent))));
+    for (int level = 0; level < 256; ++level) linear_[size_t(level)] = uint8_t(std::lround(linear(level)));
 }
 
 }  // namespace roundel

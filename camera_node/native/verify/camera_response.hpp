@@ -22,6 +22,9 @@ class CameraResponse {
     /// The image with levels in proportion to light: itself if the curve counts as linear, otherwise a copy
     /// that is valid until the next call.
     ImageView linearize(const ImageView& image);
+    /// A level of the camera's picture in the linearized one, and the reverse.
+    double linear(double level) const { return to_power(level, std::exp(log_exponent_)); }
+    double encoded(double level) const { return to_power(level, std::exp(-log_exponent_)); }
     /// Learns from fits without occlusion to a linearized image. The caller must discard models of earlier
     /// frames if this returns true: the tone curve changed.
     bool learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits);
@@ -47,7 +50,9 @@ class CameraResponse {
         ToneEstimate power;
         ToneSample sample;
     };
-    EncodedLevel encoded(double level) const;
+    static double to_power(double level, double exponent) {
+        return 255 * std::pow(std::max(level, 0.0) / 255, exponent);
+    }
     void learn_remainder(bool linearization_changed);
     std::optional<ToneMeasurement> measure(const RoundelFit& fit, const RoundelLimits& limits) const;
     void learn_edge_noise(const std::vector<const RoundelFit*>& fits);

@@ -157,16 +157,11 @@ bool PrintRatios::learn(const std::vector<PrintSample>& roundels) {
             include(kind, fit->ratio, by_curvature,
                     std::hypot(fit->ratio_sigma, kModelSigma, kSecondOrder * by_curvature));
     }
-    const bool was_decided = decided();
     for (size_t k = 0; k < kinds_.size(); ++k) {
         kinds_[k].recurs |= seen[k] >= kRecurring;
         if (kinds_[k].recurs && kinds_[k].count) assign(kinds_[k]);
     }
-    return collect() || decided() != was_decided;
-}
-
-bool PrintRatios::decided() const {
-    return std::any_of(kinds_.begin(), kinds_.end(), [](const Kind& kind) { return kind.recurs; });
+    return collect();
 }
 
 std::vector<double> PrintRatios::recurring() const {

@@ -32,8 +32,6 @@ class PrintRatios {
     bool learn(const std::vector<PrintSample>& roundels);
     /// The prints in use: the usual ones, of which some may be replaced, and others that recur.
     const std::vector<Print>& prints() const { return prints_; }
-    /// Whether any kind recurs.
-    bool decided() const;
     /// The prints that recur.
     std::vector<double> recurring() const;
     /// Discards the measurements, which hold no longer, but not what they decided.

@@ -19,6 +19,7 @@ from tests.benchmarks.detector.cameras import (
     share_found,
     uncovered,
 )
+from tests.benchmarks.detector.models import faint_found
 from tests.benchmarks.detector.pictures import sight_of
 from tests.benchmarks.detector.recall import SIZE
 from tests.benchmarks.detector.table import Run
@@ -52,6 +53,11 @@ def test_the_tone_curve_is_learned_from_the_known_ratio(tone, exponent):
 def test_a_detector_with_other_settings_keeps_what_it_learned_about_the_camera(mild: Detector):
     assert mild.tone_exponent is not None
     assert mild.adjusted(min_contrast=20.0).tone_exponent == mild.tone_exponent > 1.5
+
+
+def test_contrast_is_judged_before_the_picture_is_made_linear():
+    """Ink of 47 and paper of 88 differ by 18 linear levels: a detector that knows the tone curve finds them, too."""
+    assert faint_found(Detector(), 1) == faint_found(known(Sensor(tone="gamma")), 1) == 1
 
 
 @pytest.mark.parametrize(
