@@ -463,7 +463,8 @@ def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: Wand
     """
     total = np.bincount(observations.camera, minlength=len(names))
     fitting = np.bincount(observations.camera[adjusted.used], minlength=len(names))
-    share = (fitting - len(set(adjusted.problem.free) - set(LENS)) / 2) / total
+    fitted = np.minimum(len(set(adjusted.problem.free) - set(LENS)) / 2, total - 1)
+    share = (fitting - fitted) / (total - fitted)
     if share.min() < MIN_AGREEING:
         k = int(share.argmin())
         jump = find_jump(names, adjusted, observations)

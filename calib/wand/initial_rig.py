@@ -4,14 +4,15 @@
 The essential matrix (Nister 2004) gives the relative pose of two cameras up to scale; the wand's lengths, or the
 roundels' sizes, give the scale. The clock shift of two cameras whose relative pose is unknown: at the right shift,
 simultaneous detections of both satisfy one epipolar constraint; at a wrong shift the wand has moved. The eight-point
-algorithm (Hartley 1997) fits a fundamental matrix robustly to each trial shift.
+algorithm (Hartley 1997) fits a fundamental matrix robustly to each trial shift. Cameras that share no markers with the
+others are placed by the pose of the wand (`body_poses`).
 
 Why a camera could not be placed (a wrong clock, a mirrored image, or too few common detections) is tested by undoing
 each fault: if a camera fits another one after its timestamps are shifted, or its image is mirrored, it has that fault.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import cv2
@@ -19,6 +20,7 @@ import numpy as np
 
 from calib.errors import CameraFault
 from calib.rig.camera import transform
+from calib.wand.body_poses import BodyPlacement, has_poses
 from calib.wand.detections import (
     SAME_S,
     FrameTable,
@@ -357,12 +359,14 @@ class InitialRig:
         metric: whether the scale is known.
         rejected: inlier ratio by pair of cameras, of the pairs that share enough frame sets but whose relative pose was
             rejected; 0 where there is none.
+        reasons: why the pose of the wand places no further camera, by camera; empty for a wand without poses.
     """
 
     poses: dict[int, Array]
     offset_s: dict[int, float]
     metric: bool
     rejected: dict[tuple[int, int], float]
+    reasons: dict[int, str] = field(default_factory=dict)
 
     @property
     def placed(self) -> list[int]:
@@ -371,10 +375,18 @@ class InitialRig:
 
 
 def build_initial_rig(pairs: TwoViewGeometry, cameras: Sequence[int]) -> InitialRig:
-    """Place the largest connected group of `cameras`."""
+    """Place the largest connected group of `cameras`: by their common points, then by the pose of the wand, of which
+    cameras may see different markers."""
     tree, rejected = _build_spanning_tree(pairs, cameras)
     poses, offsets = _chain_poses(tree)
-    return InitialRig(poses, offsets, bool(tree) and tree[0].metric, rejected)
+    metric = bool(tree) and tree[0].metric
+    reasons = {}
+    if has_poses(pairs.wand) and (metric or not tree) and len(poses) < len(cameras):
+        body = BodyPlacement(pairs.tracks, pairs.detections, pairs.lenses, pairs.wand, pairs.gap_s)
+        joined, offset_s, reasons = body.extend(cameras, poses, offsets)
+        if len(joined) > max(len(poses), 1):
+            poses, offsets, metric = joined, offset_s, True
+    return InitialRig(poses, offsets, metric, rejected, reasons)
 
 
 def _build_spanning_tree(
@@ -543,6 +555,8 @@ def explain_unplaced(
         ratios = [ratio for pair, ratio in start.rejected.items() if k in pair]
         if not counts[k]:
             reasons[names[k]] = "it never saw the wand; wave the wand in front of it"
+        elif k in start.reasons:
+            reasons[names[k]] = start.reasons[k]
         elif (ratio := max(ratios, default=0.0)) > 0:
             reasons[names[k]] = (
                 f"its detections fit no other camera (at best {ratio:.0%} of the shared ones are inliers); "

@@ -12,7 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.rig.camera import transform
 from calib.rig.triangulation import intersect
+from calib.wand.body_poses import BodyLocator, has_poses
 from calib.wand.bundle_adjustment.covariance import coarse_sigma
 from calib.wand.bundle_adjustment.problem import (
     AffineWand,
@@ -61,6 +63,7 @@ def build_problem(recording: WandRecording, cameras: Array, offset_s: Array, bud
     rows, knot, knot_s = _choose_detections(recording, offset_s, budget)
     wand, gap_s = AffineWand.of(recording.wand), recording.timing.gap_s
     basis = initial_positions(recording.tracks, wand, cameras, offset_s, knot_s, gap_s)
+    basis = _locate_missing(recording, basis, cameras, offset_s, knot_s)
     known = np.asarray(np.isfinite(basis).all(axis=(1, 2)))
     if known.sum() < MIN_KNOTS:
         return None
@@ -81,6 +84,29 @@ def build_problem(recording: WandRecording, cameras: Array, offset_s: Array, bud
     )
     motion = np.stack([basis, finite_velocities(knot_s, basis, gap_s)], axis=1)
     return Estimate(problem, State.of(cameras, offset_s, motion), _observations(recording, rows, knot))
+
+
+def _locate_missing(
+    recording: WandRecording, basis: Array, cameras: Array, offset_s: Array, knot_s: Array
+) -> Array:
+    """The basis markers (K, B, 3) at the knots: those that no two cameras saw, by the pose of the wand as a rigid
+    body."""
+    missing = np.flatnonzero(np.isnan(basis).any(axis=(1, 2)))
+    if not len(missing) or not has_poses(recording.wand):
+        return basis
+    points = recording.wand.points
+    locator = BodyLocator(
+        recording.tracks,
+        points,
+        dict(enumerate(cameras)),
+        dict(enumerate(offset_s.tolist())),
+        recording.timing.gap_s,
+    )
+    basis, markers = basis.copy(), points[AffineWand.of(recording.wand).basis]
+    for k, allowed in zip(missing.tolist(), locator.locate(knot_s[missing]), strict=True):
+        if allowed:
+            basis[k] = transform(allowed[0], markers)
+    return basis
 
 
 def add_background(recording: WandRecording, estimate: Estimate) -> Estimate:

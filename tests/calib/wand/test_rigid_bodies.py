@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Cameras that see different sides of the wand are joined by its pose as a rigid body."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.commands.formats import ImportData
+from calib.rig.camera import transform
+from calib.rig.rig import load_rig
+from calib.rig.wand_file import WandBody, load_wand
+from calib.wand.body_poses import BodyLocator, solve_view
+from calib.wand.calibrate import calibrate
+from calib.wand.detections import MarkerTrack
+from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array, Mask
+from camera_node.geometry.pose import invert, rotation_from_vector
+from camera_node.protocol.messages import Detections
+from camera_node.sources.recorded_detections import read_observations
+from tests.calib.synthetic import CAREFUL, Arena, camera_errors, joint_error, ring, roughly
+
+HALF, SIGMA_PX = 0.15, 0.2
+CORNERS = 0.8 * HALF * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+NORMALS = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
+UPRIGHT = np.array([0.0, 0.0, 1.0])
+
+
+def cube() -> WandBody:
+    """Four markers on each of the upright sides of a cube, numbered side by side."""
+    points = [
+        HALF * normal + u * np.cross(UPRIGHT, normal) + v * UPRIGHT for normal in NORMALS for u, v in CORNERS
+    ]
+    return WandBody(markers=tuple(map(tuple, np.array(points).tolist())))
+
+
+CUBE = cube()
+
+
+def sees_sides(most: int) -> Callable[[Array], Mask]:
+    """The sides (4,) that a camera sees, from the cosines (4,) of the angles at which they face it: up to `most`."""
+
+    def choose(cosine: Array) -> Mask:
+        chosen = np.zeros(4, bool)
+        chosen[np.argsort(-cosine)[:most]] = True
+        return chosen & (cosine > 0.2)
+
+    return choose
+
+
+def wave(
+    arena: Arena, sides: int, frames: int, seed: int, period_ns: int = 500_000_000, phase: float = 0.0
+) -> list[Detections]:
+    """Record the cube with the sides that face each camera most, numbered; `phase` of a period from camera to
+    camera."""
+    rng, messages, choose = np.random.default_rng(seed), [], sees_sides(sides)
+    for seq in range(frames):
+        for number, (name, camera) in enumerate(arena.truth.cameras.items()):
+            t_ns = int((seq + phase * number) * period_ns)
+            T = arena.wand_pose(1e-9 * t_ns)
+            points, place = transform(T, CUBE.points), camera.matrix()[:3, 3] - T[:3, 3]
+            chosen = choose(NORMALS @ T[:3, :3].T @ place / np.linalg.norm(place))
+            uv = camera.project_world(points) + SIGMA_PX * rng.standard_normal((16, 2))
+            seen = np.flatnonzero(np.repeat(chosen, 4) & camera.sees(uv))
+            roundels = Roundels.from_points(uv[seen], SIGMA_PX, seen.astype(np.int32))
+            header = {"camera": name, "width": camera.width, "height": camera.height}
+            messages.append(Detections.pack(roundels, seq=seq, t_ns=t_ns, **header))
+    return messages
+
+
+def only(messages: list[Detections], name: str, keep: Callable[[Detections], bool]) -> list[Detections]:
+    """The messages, of one camera those for which `keep` is true."""
+    return [message for message in messages if message.camera != name or keep(message)]
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+def test_eight_cameras_around_a_cube_are_placed_with_an_honest_covariance(sides: int):
+    """Chi-square of all poses over its 42 degrees of freedom, three times: within 0.6 and 1.6 but for one in 10^4."""
+    arena = ring(8, wand=CUBE)
+    ratios = []
+    for seed in range(3):
+        rig = roughly(arena.intrinsics, CAREFUL, with_sigma=True, seed=seed)
+        result = calibrate(rig, CUBE, wave(arena, sides, 60, seed), synchronous=True)
+        assert len(result.rig.placed()) == 8
+        assert camera_errors(result.rig, arena.truth)[0].max() < 0.02
+        chi2, degrees = joint_error(result, arena.truth)
+        ratios.append(chi2 / degrees)
+    assert 0.6 < np.mean(ratios) < 1.6
+
+
+def test_one_frame_places_a_camera_that_saw_two_sides():
+    arena = ring(4, wand=CUBE)
+    messages = only(wave(arena, 2, 40, 0), "cam2", lambda message: message.seq == 3)
+    result = calibrate(arena.intrinsics, CUBE, messages, synchronous=True)
+    assert len(result.rig.placed()) == 4
+    sigma = {name: np.sqrt(np.diag(c.covariance)[3:].sum()) for name, c in result.rig.cameras.items()}
+    assert sigma["cam2"] > 2 * sigma["cam0"]
+    assert camera_errors(result.rig, arena.truth)[0][2] < 4 * sigma["cam2"]
+
+
+def test_one_frame_of_one_side_leaves_a_camera_out_where_it_allows_two_poses():
+    arena = ring(4, wand=CUBE)
+    messages = only(wave(arena, 2, 40, 0), "cam2", lambda message: message.seq == 7)
+    result = calibrate(arena.intrinsics, CUBE, messages, synchronous=True)
+    assert "allow two poses" in result.report.unplaced["cam2"]
+
+
+def test_free_running_cameras_are_joined_by_the_body_too():
+    arena = ring(4, wand=CUBE)
+    messages = wave(arena, 1, 150, 0, period_ns=50_000_000, phase=0.24)
+    result = calibrate(arena.intrinsics, CUBE, messages)
+    assert len(result.rig.placed()) == 4
+    assert camera_errors(result.rig, arena.truth)[0].max() < 0.03
+
+
+def test_cameras_that_never_saw_the_wand_together_are_named_with_what_would_connect_them():
+    """cam2 and cam3 record after cam0 and cam1."""
+    arena, late = ring(4, wand=CUBE), ("cam2", "cam3")
+    messages = [m for m in wave(arena, 2, 80, 0) if (m.camera in late) == (m.seq >= 40)]
+    result = calibrate(arena.intrinsics, CUBE, messages, synchronous=True)
+    assert set(result.report.unplaced) in ({"cam0", "cam1"}, {"cam2", "cam3"})
+    for reason in result.report.unplaced.values():
+        assert "any side of the wand" in reason
+
+
+def test_one_view_of_a_plane_leaves_two_poses_and_a_second_camera_decides():
+    """A small square, far away and nearly frontal."""
+    camera = ring(2).truth.cameras["cam0"]
+    square = 0.3 * np.column_stack([CORNERS, np.zeros(4)])
+    T_cam_wand = np.eye(4)
+    T_cam_wand[:3, :3], T_cam_wand[:3, 3] = rotation_from_vector([0.25, 0.1, 0.3]), [0.1, 0.2, 4.0]
+    beside = np.eye(4)
+    beside[:3, :3], beside[:3, 3] = rotation_from_vector([0, -0.7, 0]), [2.5, 0, 1.0]
+    images = [transform(T, square) for T in (T_cam_wand, invert(beside) @ T_cam_wand)]
+    rng = np.random.default_rng(0)
+    images = [p[:, :2] / p[:, 2:] + 0.2 / camera.fx * rng.standard_normal((4, 2)) for p in images]
+    assert len(solve_view(square, images[0])) == 2
+    tracks = [[MarkerTrack.of(np.zeros(1), xy[None]) for xy in image] for image in images]
+    alone = BodyLocator(tracks, square, {0: np.eye(4)}, {0: 0.0}, 0.0)
+    assert len(alone.locate(np.zeros(1))[0]) == 2
+    both = BodyLocator(tracks, square, {0: np.eye(4), 1: beside}, {0: 0.0, 1: 0.0}, 0.0)
+    (found,) = both.locate(np.zeros(1))[0][:1]
+    assert transform(found, square) == pytest.approx(transform(T_cam_wand, square), abs=0.02)
+
+
+DATA = Path(os.environ.get("ROUNDEL_SHARED_DATA", "/work/shared/data")) / "tag_wand"
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"{DATA} is absent")
+def test_the_tag_wand_of_tagslam_places_all_eight_cameras(tmp_path: Path):
+    """One camera sees a single tag in a single frame, another shares no tag with any. A plain bundle adjustment of all
+    points has 0.45 px, TagSLAM 0.53 px."""
+    ImportData(format="kalibr", files=(DATA / "camchain.yaml",), out=tmp_path).run()
+    rig = load_rig(tmp_path / "rig.yaml")
+    sizes = {name: (lens.width, lens.height) for name, lens in rig.cameras.items()}
+    messages = read_observations(DATA / "wand.csv", sizes)
+    result = calibrate(rig, load_wand(DATA / "wand.yaml"), messages, synchronous=True)
+    assert len(result.rig.placed()) == 8
+    assert len(np.unique(result.adjusted.problem.knot_s)) == 101
+    assert np.sqrt(np.mean(result.adjusted.residuals[result.adjusted.used] ** 2)) < 0.45
