@@ -7,6 +7,9 @@ whatever markers, give one pose: the solution of one view that fits all of them 
 then points of known position, and a further camera is placed by its images of them at all instants together, robustly
 (RANSAC), then by least squares. Of an instant that only one camera saw, both solutions count: those of other instants
 decide. Markers on a line give no pose.
+
+Relative poses of pairs of cameras are not averaged: the pose of a small part of the body is uncertain by degrees, and
+its two solutions by tens of degrees, while an image of it is uncertain by a fraction of a pixel.
 """
 
 from collections.abc import Iterator, Sequence

@@ -459,12 +459,13 @@ def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: Wand
     """Raise CameraFault where most detections of a camera contradict those of the other cameras.
 
     Only the worst camera is named, because a wrong camera makes others look wrong. The d parameters of a camera's pose
-    and clock fit d coordinates of any detections, so these do not count.
+    and clock fit d coordinates of any detections, so these do not count. A camera of which none is rejected contradicts
+    nothing, however few it has.
     """
     total = np.bincount(observations.camera, minlength=len(names))
     fitting = np.bincount(observations.camera[adjusted.used], minlength=len(names))
-    fitted = np.minimum(len(set(adjusted.problem.free) - set(LENS)) / 2, total - 1)
-    share = (fitting - fitted) / (total - fitted)
+    share = (fitting - len(set(adjusted.problem.free) - set(LENS)) / 2) / total
+    share[fitting == total] = 1.0
     if share.min() < MIN_AGREEING:
         k = int(share.argmin())
         jump = find_jump(names, adjusted, observations)
