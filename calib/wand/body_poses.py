@@ -151,13 +151,14 @@ class BodyLocator:
         candidates, instant = candidates[chosen], instant[chosen]
         rows, owner = _repeat(views.instant, instant)
         poses, costs = self._refine(candidates, views.select(rows), owner)
+        least = np.full(len(t_s), np.inf)
         for c in np.lexsort((costs, instant)).tolist():
-            found = allowed[instant[c]]
-            if not found:
-                least = costs[c]
+            k, found = instant[c], allowed[instant[c]]
+            if not found or (
+                len(found) == 1 and costs[c] < least[k] + MARGIN and _differ(poses[c], found[0], self.points)
+            ):
                 found.append(poses[c])
-            elif len(found) == 1 and costs[c] < least + MARGIN and _differ(poses[c], found[0], self.points):
-                found.append(poses[c])
+            least[k] = min(least[k], costs[c])
         return allowed
 
     def sees(self, t_s: Array) -> Mask:
@@ -193,7 +194,8 @@ class BodyLocator:
         """(P,) Cauchy's cost of poses (P, 4, 4): twice the negative log likelihood of their images, which have the pose
         `owner` (n,)."""
         error = views.xy - self._project(poses, views, owner)[1]
-        return np.bincount(owner, 2 * np.log1p((error**2).sum(axis=1) / SIGMA_RAD**2 / 2), len(poses))
+        cost = 2 * np.log1p((error**2).sum(axis=1) / SIGMA_RAD**2 / 2)
+        return np.asarray(np.bincount(owner, cost, len(poses)), float)
 
     def _project(self, poses: Array, views: _Views, owner: Index) -> tuple[Array, Array]:
         """(n, 3) the markers in the cameras' frames, and (n, 2) their image plane coordinates."""
@@ -431,28 +433,29 @@ def _collect(locator: BodyLocator, detections: WandDetections) -> _Images | None
 
 def _starts(images: _Images) -> Iterator[Array]:
     """Poses T_cam_world by RANSAC of all images, and by single views of the body."""
-    cv2.setRNGSeed(0)
-    try:
-        found, turn, shift, _ = cv2.solvePnPRansac(
-            images.points,
-            images.xy,
-            np.eye(3),
-            None,
-            iterationsCount=TRIALS,
-            reprojectionError=GATE_RAD,
-            confidence=0.9999,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-    except cv2.error:
-        found = False
-    if found:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+    if (T := _ransac(images)) is not None:
         yield T
     poses = np.unique(images.pose)
     for pose in poses[np.linspace(0, len(poses) - 1, min(FRAMES // 16, len(poses))).round().astype(int)]:
         mine = images.pose == pose
         yield from solve_view(images.points[mine], images.xy[mine])
+
+
+def _ransac(images: _Images) -> Array | None:
+    """T_cam_world that most images fit; None where none is found."""
+    cv2.setRNGSeed(0)
+    options = {"iterationsCount": TRIALS, "reprojectionError": GATE_RAD, "confidence": 0.9999}
+    try:
+        found, turn, shift, _ = cv2.solvePnPRansac(
+            images.points, images.xy, np.eye(3), None, **options, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:
+        return None
+    if not found:
+        return None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+    return T
 
 
 def _refine_camera(images: _Images, T: Array, sigma: float) -> Array | None:

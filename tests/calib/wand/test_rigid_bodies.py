@@ -95,7 +95,7 @@ def test_one_frame_places_a_camera_that_saw_two_sides():
     messages = only(wave(arena, 2, 40, 0), "cam2", lambda message: message.seq == 3)
     result = calibrate(arena.intrinsics, CUBE, messages, synchronous=True)
     assert len(result.rig.placed()) == 4
-    sigma = {name: np.sqrt(np.diag(c.covariance)[3:].sum()) for name, c in result.rig.cameras.items()}
+    sigma = {n: np.sqrt(np.diag(np.array(c.covariance))[3:].sum()) for n, c in result.rig.cameras.items()}
     assert sigma["cam2"] > 2 * sigma["cam0"]
     assert camera_errors(result.rig, arena.truth)[0][2] < 4 * sigma["cam2"]
 
