@@ -6,6 +6,7 @@ import sys
 
 from web.errors import WebError
 
+NAMES = {"calib": "calibrate "}  # between `roundel` and the name of a command
 TIMEOUT_S = 1800.0  # a recording of hours is fused in this time
 
 
@@ -15,7 +16,7 @@ def run_program(program: str, *words: object, timeout_s: float = TIMEOUT_S) -> N
     Raises:
         WebError: it failed, with its error message, or it did not end within `timeout_s`.
     """
-    name = f"{program} {words[0]}"
+    name = f"roundel {NAMES.get(program, '')}{words[0]}"
     command = [sys.executable, "-m", program, *map(str, words)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)

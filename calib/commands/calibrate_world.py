@@ -14,7 +14,7 @@ from calib.commands.output import check_folder, conclude, provenance, write_rig
 from calib.errors import CalibrationError
 from calib.live.collect import collect_with_progress
 from calib.rig.rig import Rig, load_rig
-from calib.world.landmarks import align_to_roundels, name_markers, read_positions
+from calib.world.landmarks import FRAME, SURVEY, WAND, align_to_roundels, name_markers, read_positions
 from calib.world.resection import place_by_points
 from calib.world.still_roundels import find_still_roundels
 from calib.world.world_frame import align_cameras, check_above, is_collinear
@@ -92,7 +92,8 @@ class World:
         landmarks = read_positions(file, "name") if body is None else name_markers(body)
         _check_landmarks(landmarks, file, on_line=self.standing is not None)
         foot = self.foot if self.standing is not None else None
-        change = align_to_roundels(rig, landmarks, self._read_roundels(rig, body), foot)
+        of = FRAME if self.frame is not None else WAND if self.standing is not None else SURVEY
+        change = align_to_roundels(rig, landmarks, self._read_roundels(rig, body), foot, of)
         if change.missing:
             say(
                 f"warning: fewer than two cameras see the roundel at {', '.join(change.missing)}; it is not used"

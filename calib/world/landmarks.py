@@ -30,6 +30,9 @@ from camera_node.protocol.messages import Detections
 
 FIT_PX = 6.0  # reprojection distance of a match: rig, survey and detection all have errors
 MERGE_M = 0.02  # distance within which triangulated points are one
+MAX_LISTED = 4  # points whose distances an error lists
+FRAME, WAND = "the roundels of the L-frame", "the roundels of the wand"
+SURVEY = "the surveyed points"  # what has the landmarks, in errors, unless it is a frame or a wand
 DISTANCE_SLACK = (0.02, 0.03)  # of a distance between landmarks: metres, and fraction of the distance
 
 
@@ -101,7 +104,11 @@ def name_markers(body: Body) -> dict[str, Array]:
 
 
 def align_to_roundels(
-    rig: Rig, landmarks: Mapping[str, Array], messages: Sequence[Detections], foot_m: float | None = None
+    rig: Rig,
+    landmarks: Mapping[str, Array],
+    messages: Sequence[Detections],
+    foot_m: float | None = None,
+    of: str = SURVEY,
 ) -> WorldChange:
     """Move the world to stationary roundels.
 
@@ -111,15 +118,20 @@ def align_to_roundels(
         messages: detections of the cameras while the roundels stand still.
         foot_m: for a wand that stands upright: the height of its lowest roundel above the floor; None for roundels
             whose positions fix the world.
+        of: what has the roundels, in errors, such as "the roundels of the L-frame".
 
     Raises:
         CalibrationError: the roundels are not found, or do not fix a world.
     """
-    located = locate_landmarks(rig.placed(), find_still_roundels(messages), landmarks)
+    located = locate_landmarks(rig.placed(), find_still_roundels(messages), landmarks, of)
     missing = [name for name in landmarks if name not in located]
     if foot_m is not None:
         moved = align_standing_wand(rig, np.array(list(located.values())), foot_m)
         return WorldChange(moved, missing=missing)
+    if len(located) < 3:
+        raise CalibrationError(
+            f"two cameras together see only {len(located)} of {of}, and a world needs three: let two cameras see all"
+        )
     moved, distances = align_positions(rig, located, landmarks, "roundel")
     check_above(moved, landmarks)
     return WorldChange(moved, distances, missing)
@@ -140,7 +152,10 @@ class _Hypothesis:
 
 
 def locate_landmarks(
-    cameras: Mapping[str, Camera], roundels: Sequence[StillRoundel], landmarks: Mapping[str, Array]
+    cameras: Mapping[str, Camera],
+    roundels: Sequence[StillRoundel],
+    landmarks: Mapping[str, Array],
+    of: str = SURVEY,
 ) -> dict[str, Array]:
     """Locate landmarks in the rig's world.
 
@@ -148,6 +163,7 @@ def locate_landmarks(
         cameras: placed cameras.
         roundels: stationary roundels; a number that is the name of a landmark identifies it.
         landmarks: surveyed positions (3,) by name, metres, in a frame of their own.
+        of: what has the landmarks, in errors.
 
     Returns:
         (3,) metres in the rig's world, by name; landmarks that fewer than two cameras see are missing.
@@ -168,12 +184,42 @@ def locate_landmarks(
     if max((h.count for h in hypotheses), default=0) < needed:
         counts = ", ".join(f"{name} {sum(r.camera == name for r in roundels)}" for name in sorted(cameras))
         raise CalibrationError(
-            f"no {needed} of the stationary roundels (by camera: {counts}) have the distances of the surveyed "
-            "points; check that two cameras see each roundel, that the file is in metres, and the rig's scale"
+            f"no {needed} of the stationary roundels (by camera: {counts}) have the distances of {of}: "
+            f"{_explain_distances(_most_seen(cameras, roundels, points), surveyed)}"
         )
     hypotheses.sort(key=lambda h: (h.count, -h.distance_px), reverse=True)
-    _check_unique(hypotheses)
+    _check_unique(hypotheses, of)
     return _triangulate(cameras, hypotheses[0].matches)
+
+
+def _explain_distances(points: Array, surveyed: Array) -> str:
+    """What is seen in place of the landmarks, and what to do."""
+    needed = min(3, len(surveyed))
+    if len(points) < needed:
+        return f"two cameras together see only {len(points)} roundels that keep still; let two cameras see all of them"
+    expected = _list_distances(surveyed)
+    if len(points) > MAX_LISTED:
+        return f"these are {expected}; measure them again, and check the scale of the calibration"
+    return (
+        f"these are {expected}, the cameras see roundels at {_list_distances(points)}; correct its "
+        "file, or lay the roundels as the file says"
+    )
+
+
+def _most_seen(cameras: Mapping[str, Camera], roundels: Sequence[StillRoundel], points: Array) -> Array:
+    """The points that most cameras see: wrong pairs of roundels give points that two see."""
+    seen = np.zeros(len(points))
+    for name, camera in cameras.items():
+        own = np.array([r.uv for r in roundels if r.camera == name]).reshape(-1, 2)
+        if len(own) and len(points):
+            away = np.linalg.norm(camera.project_world(points)[:, None] - own, axis=2)
+            seen += (np.nan_to_num(away, nan=np.inf) < FIT_PX).any(axis=1)
+    return points[seen == seen.max()] if len(points) else points
+
+
+def _list_distances(points: Array) -> str:
+    lengths = sorted(float(np.linalg.norm(a - b)) for a, b in combinations(points, 2))
+    return ", ".join(f"{length:.2f}" for length in lengths) + " m"
 
 
 def _triangulate_pairs(cameras: Mapping[str, Camera], roundels: Sequence[StillRoundel]) -> Array:
@@ -254,7 +300,7 @@ def _match(
     return _Hypothesis(len(counted), distance_px, matches)
 
 
-def _check_unique(hypotheses: Sequence[_Hypothesis]) -> None:
+def _check_unique(hypotheses: Sequence[_Hypothesis], of: str) -> None:
     """Raise CalibrationError if another assignment is as good as that of the first hypothesis; the best come first."""
     best = hypotheses[0]
     for other in hypotheses[1:]:
@@ -262,8 +308,8 @@ def _check_unique(hypotheses: Sequence[_Hypothesis]) -> None:
             return
         if other.assignment() != best.assignment():
             raise CalibrationError(
-                "the surveyed points match the roundels in two ways (they are symmetric); use unequal distances, such "
-                "as an L with legs of 0.3 m and 0.5 m, or number the roundels in the recording"
+                f"{of} match the roundels in two ways (they are symmetric); use unequal distances, such as an L with "
+                "legs of 0.3 m and 0.5 m"
             )
 
 

@@ -110,6 +110,7 @@ class WandSessionPanel:
 
     def _forget(self) -> None:
         self._candidate = None
+        set_content(self._cameras, "")  # its advice is for the session that is over
         self._preview.draw(None)
         self._files.candidate.unlink(missing_ok=True)
 

@@ -9,7 +9,7 @@ import viser
 
 from calib.live.collect import collect_frames
 from calib.rig.rig import Rig
-from calib.world.landmarks import WorldChange, align_to_roundels, name_markers
+from calib.world.landmarks import FRAME, WAND, WorldChange, align_to_roundels, name_markers
 from calib.world.world_frame import is_collinear
 from camera_node.foundation.config import example_file, load_yaml
 from camera_node.geometry.body import Body
@@ -84,7 +84,9 @@ class WorldPanel:
         session, arena = self._subscription.session, self._subscription.feed.keys.arena
         collected, _ = collect_frames(session, arena, self._collect_s, lambda *_: "")
         foot_m = float(self._foot.value) if standing else None
-        change = align_to_roundels(rig, name_markers(body), collected.messages, foot_m)
+        change = align_to_roundels(
+            rig, name_markers(body), collected.messages, foot_m, WAND if standing else FRAME
+        )
         self._before, self._change = rig, change
         self._preview.draw(change.origin_in(rig))
         missed = f"; not used: roundel {', '.join(change.missing)}" if change.missing else ""

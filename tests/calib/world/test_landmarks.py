@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Landmarks: reading their surveyed positions, and finding them among stationary roundels."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibrationError
-from calib.world.landmarks import locate_landmarks, read_positions
+from calib.world.landmarks import FRAME, locate_landmarks, read_positions
 from calib.world.still_roundels import find_still_roundels
 from calib.world.world_frame import align_positions, align_standing_wand, check_above
 from camera_node.foundation.config import load_yaml
@@ -102,6 +103,30 @@ def test_landmarks_that_match_nothing_or_in_two_ways_are_refused():
     roundels = find_still_roundels(detect_landmarks(arena, {k: v.tolist() for k, v in square.items()}))
     with pytest.raises(CalibrationError, match="two ways"):
         locate_landmarks(arena.truth.cameras, roundels, square)
+
+
+def test_an_l_frame_with_another_leg_is_answered_with_its_lengths():
+    """A file with the lengths that the error lists fixes the world."""
+    arena = ring(4)
+    real = {"0": [0.0, 0.0, 0.0], "1": [0.3, 0.0, 0.0], "2": [0.0, 0.7, 0.0]}
+    roundels = find_still_roundels(see_discs(arena, real, [0.0, 0.0, 1.0], 0.06))
+    false = {"0": np.zeros(3), "1": np.array([0.3, 0.0, 0.0]), "2": np.array([0.0, 0.5, 0.0])}
+    with pytest.raises(
+        CalibrationError, match="distances of the roundels of the L-frame: these are"
+    ) as error:
+        locate_landmarks(arena.truth.cameras, roundels, false, FRAME)
+    assert "surveyed" not in str(error.value)
+    listed = re.findall(r"[0-9.]+(?=[, ])", str(error.value).partition("see roundels at ")[2])[:2]
+    assert listed == ["0.30", "0.70"]
+    stated = {
+        "0": np.zeros(3),
+        "1": np.array([float(listed[0]), 0, 0]),
+        "2": np.array([0, float(listed[1]), 0]),
+    }
+    assert set(locate_landmarks(arena.truth.cameras, roundels, stated, FRAME)) == {"0", "1", "2"}
+    alone = [roundel for roundel in roundels if roundel.camera == "cam0"]
+    with pytest.raises(CalibrationError, match="two cameras together see only 0 roundels"):
+        locate_landmarks(arena.truth.cameras, alone, false, FRAME)
 
 
 def test_the_shipped_frame_fixes_a_world():
