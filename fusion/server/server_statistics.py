@@ -19,6 +19,7 @@ from fusion.protocol.pose_messages import CameraHealth, FusionStatus, TrackingSt
 from fusion.tracking.result import CameraUse
 
 log = logging.getLogger("fusion")
+ON_TIME_S = 30.0  # without a late frame, after which a camera is on time again: at most two lines a minute
 SILENT_S = 2.0  # without a frame: a camera is gone
 PERIOD_NS = 1_000_000_000
 
@@ -60,7 +61,9 @@ class _CameraCounts:
     is_gone: bool = False
     is_retired: bool = False  # renamed or forgotten: not listed, although its last frames may still arrive
     taken_ns: int = 0  # when its newest frame was taken
-    is_late: bool = False
+    late_since_ns: int = 0  # of the state in which its frames are too late; 0 while they are on time
+    late_ns: int = 0  # when the last frame arrived too late
+    late_before: int = 0  # frames that were too late before this state
     has_two_publishers: bool = False
     was_excluded: bool = False  # at some time since the last status
     lateness_ms: list[float] = field(default_factory=list)
@@ -137,16 +140,23 @@ class ServerStatistics:
         camera.has_two_publishers = has_two_publishers
 
     def note_lateness(self, name: str, is_on_time: bool, age_ms: float) -> None:
-        """Log once that a camera's frames begin to arrive too late, and once that they are on time again."""
+        """Log when a camera's frames begin to arrive too late, and once none was for `ON_TIME_S`, with their number.
+
+        On a busy machine some frames are late and others are not: that is one state.
+        """
         camera, limit_ms = self._cameras[name], self._lateness_limit_ms
-        camera.late += not is_on_time
-        if not is_on_time and not camera.is_late:
-            late = "%s is %.0f ms late (limit %.0f ms); its frames are dropped"
-            log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
-            camera.is_late = True
-        elif is_on_time and camera.is_late and age_ms < limit_ms:
-            log.info("%s is on time again", name, extra=self._about(name))
-            camera.is_late = False
+        now_ns = camera.last_ns
+        if not is_on_time:
+            if not camera.late_since_ns:
+                late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
+                log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
+                camera.late_since_ns, camera.late_before = now_ns, camera.late
+            camera.late, camera.late_ns = camera.late + 1, now_ns
+        elif camera.late_since_ns and age_ms < limit_ms and now_ns - camera.late_ns > ON_TIME_S * 1e9:
+            seconds, count = (camera.late_ns - camera.late_since_ns) * 1e-9, camera.late - camera.late_before
+            text = "%s is on time again: %d of its frames in %.0f s were too late and were dropped"
+            log.info(text, name, count, seconds, extra=self._about(name))
+            camera.late_since_ns = 0
 
     def count_frame_set(
         self, cameras: dict[str, CameraUse], robots: dict[str, TrackingState], latency_ms: float | None

@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A camera that was renamed or forgotten disappears from the status; one that is silent stays."""
+"""A camera that was renamed or forgotten disappears from the status; one that is silent stays. A state that
+lasts is told once."""
 
-from fusion.server.server_statistics import SILENT_S, PipelineStatus, ServerStatistics
+import logging
+
+import pytest
+
+from fusion.server.server_statistics import ON_TIME_S, SILENT_S, PipelineStatus, ServerStatistics
 
 
 def test_a_retired_camera_is_listed_no_more_until_a_camera_has_its_name_again():
@@ -21,3 +26,21 @@ def test_a_retired_camera_is_listed_no_more_until_a_camera_has_its_name_again():
     statistics.retire("old")
     statistics.retire("old", False)
     assert set(statistics.report(later + 9 * second, PipelineStatus()).cameras) == {"old", "pulled"}
+
+
+def test_a_camera_that_is_late_now_and_then_is_told_twice(caplog: pytest.LogCaptureFixture):
+    """Every second frame for a minute: one line at the begin, one after the end with the number of frames."""
+    statistics, period_ns = ServerStatistics(150.0), 10**8
+    caplog.set_level(logging.INFO, "fusion")
+    for k in range(1, 1 + round((60 + 2 * ON_TIME_S) * 10)):
+        is_late = k <= 600 and k % 2 == 0
+        t_ns = k * period_ns
+        statistics.count_arrival("cam0", t_ns, t_ns)
+        statistics.note_lateness("cam0", not is_late, 390.0 if is_late else 20.0)
+    told = [record.getMessage() for record in caplog.records if "appeared" not in record.getMessage()]
+    assert told == [
+        "cam0 is 390 ms late (limit 150 ms); its late frames are dropped",
+        "cam0 is on time again: 300 of its frames in 60 s were too late and were dropped",
+    ]
+    statistics.note_lateness("cam0", False, 390.0)
+    assert "390 ms late" in caplog.records[-1].getMessage()
