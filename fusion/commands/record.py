@@ -7,7 +7,7 @@ from calib.rig.recording import RecordingWriter
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
-from fusion.recordings.arena_recording import ArenaRecorder
+from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder
 from fusion.recordings.rotation import RotatingWriter, Rotation
 
 
@@ -45,6 +45,8 @@ def record(
     for reason, count in recorder.lost.items():
         say(f"not written: {count} {reason}")
     say(f"wrote {writer.path}")
+    if recorder.robots == frozenset():
+        say(f"warning: {NO_ROBOTS}")
     if not writer.counts:
         say(
             f"warning: the recording is empty: no message of arena '{connection.arena}' arrived from "

@@ -60,7 +60,7 @@ class RecordedPoses:
     def _check(self) -> None:
         if not self.counts and not self._robots:
             raise ConfigError(
-                f"{self.path} holds no poses; write them with fusion replay {self.path} --out fused.mcap"
+                f"{self.path} holds no poses; write them with roundel replay {self.path} --out fused.mcap"
             )
         if missing := sorted(self._robots - set(self.counts)):
             raise ConfigError(f"{self.path} holds no poses of {', '.join(missing)}; check --robots")

@@ -6,6 +6,8 @@ clock. The recorder requests the active rig and the robots from the server, so a
 that a replay needs.
 """
 
+import contextlib
+import logging
 import math
 import queue
 import threading
@@ -27,6 +29,7 @@ from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusedFrames, FusionStatus, RobotPose, Robots, robots_key
 from fusion.recordings.rotation import RotatingWriter
 
+log = logging.getLogger("fusion.recording")
 Entry = tuple[str, bytes, int]  # key, data, time of arrival in ns
 QUEUE_SIZE = 20_000
 MAX_MESSAGE_BYTES = 1 << 22  # a frame with 4096 roundels has 0.3 MB
@@ -37,6 +40,7 @@ WAIT_S = 0.1
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
 # For the answer of a busy server, also after the end of a recording: without the robots there is no replay.
 ANSWER_S = 10.0
+NO_ROBOTS = "no robot is declared: a replay of this recording needs --robots robots.yaml"
 
 
 @dataclass
@@ -94,12 +98,15 @@ class ArenaRecorder:
 
     Attributes:
         lost: messages that were not written, by reason.
+        robots: the names that the server declared last; None before its answer.
     """
 
     def __init__(
         self, connection: ServerConnection, arena: str, writer: RecordingWriter | RotatingWriter
     ) -> None:
         self.lost: Counter[str] = Counter()
+        self.robots: frozenset[str] | None = None
+        self._named: frozenset[str] | None = None  # robots of the last status; a shard names its own
         self._connection, self._arena, self._writer = connection, arena, writer
         self._session: zenoh.Session | None = None
         self._subscriber: zenoh.Subscriber | None = None
@@ -181,6 +188,25 @@ class ArenaRecorder:
         self._writer.put(key, data, received_ns)
         if key in self._missing:
             self._missing.remove(key)
+        if key in (robots_key(self._arena), Keys(self._arena).fusion_status):
+            self._note_robots(key, data)
+
+    def _note_robots(self, key: str, data: bytes) -> None:
+        """Follow the declared robots: request them again when a status names others; invalid messages are skipped."""
+        with contextlib.suppress(MessageError):
+            if key == robots_key(self._arena):
+                is_first, self.robots = self.robots is None, frozenset(decode(data, Robots).robots)
+                if is_first and not self.robots:
+                    log.warning(
+                        "arena %s: %s; robots that are declared meanwhile are recorded",
+                        self._arena,
+                        NO_ROBOTS,
+                    )
+                return
+            status = decode(data, FusionStatus)
+            before, self._named = self._named, frozenset((*status.robots, *status.not_acquired))
+            if self.robots is not None and self._named != (self.robots if before is None else before):
+                self._missing = list({*self._missing, robots_key(self._arena)})
 
     def _request_missing(self) -> None:
         """Query the server for the rig and the robots; the replies are recorded as if they were published."""

@@ -11,7 +11,7 @@ import viser
 
 from calib.rig.recording import RecordingWriter
 from camera_node.foundation.errors import ConfigError, RoundelError
-from fusion.recordings.arena_recording import ArenaRecorder
+from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder
 from fusion.recordings.recording_files import (
     RecordingSummary,
     list_recordings,
@@ -53,6 +53,7 @@ class Recorder:
         self._lock, self._stop = threading.Lock(), threading.Event()
         self._thread: threading.Thread | None = None
         self._writer: RecordingWriter | None = None
+        self._recorder: ArenaRecorder | None = None
         self._name = gui.add_text("Name", "", hint="of the file; empty for date and time")
         self._answer = Answer(gui)
         self._button = ActionButton(gui, "Start recording", self.toggle, self._answer)
@@ -97,9 +98,10 @@ class Recorder:
             self._thread.join(CLOSE_S)
 
     def _record(self, writer: RecordingWriter) -> None:
-        recorder = ArenaRecorder(self._subscription.connection, self._subscription.feed.keys.arena, writer)
+        arena = self._subscription.feed.keys.arena
+        self._recorder = ArenaRecorder(self._subscription.connection, arena, writer)
         try:
-            recorder.run(self._stop)
+            self._recorder.run(self._stop)
             writer.__exit__()
         except RoundelError as error:  # the disk is full
             self._answer.show(str(error), "bad")
@@ -107,7 +109,8 @@ class Recorder:
     def _describe(self, verb: str) -> str:
         if self._writer is None:
             return ""
-        return f"{verb} {self._writer.path}: {sum(dict(self._writer.counts).values())} messages"
+        without = f"; {NO_ROBOTS}" if self._recorder and self._recorder.robots == frozenset() else ""
+        return f"{verb} {self._writer.path}: {sum(dict(self._writer.counts).values())} messages{without}"
 
 
 class RecordingList:

@@ -19,7 +19,7 @@ from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import Robots
-from fusion.recordings.arena_recording import ArenaRecorder, read_recording
+from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder, read_recording
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
@@ -63,6 +63,26 @@ def test_a_replay_repeats_the_poses(tmp_path):
     replay(tmp_path / "in.mcap", out=tmp_path / "poses.csv")
     with (tmp_path / "poses.csv").open() as file:
         assert [int(row["t_ns"]) for row in csv.DictReader(file)] == [pose.t_ns for pose in expected]
+
+
+def test_robots_that_are_declared_after_the_start_are_recorded(tmp_path, caplog: pytest.LogCaptureFixture):
+    """Without any, the recorder says at its start what is missing; with them, a replay needs no file of robots."""
+    path, stop = tmp_path / "later.mcap", threading.Event()
+    with serving(config(tmp_path)) as (server, client), RecordingWriter(path) as writer:
+        client.change_robots(remove=("a",))
+        recorder = ArenaRecorder(client.connection, "test", writer)
+        thread = threading.Thread(target=recorder.run, args=(stop,))
+        thread.start()
+        wait_for(lambda: recorder.robots == frozenset())
+        wait_for(lambda: NO_ROBOTS in caplog.text)
+        client.change_robots(define={"late": TRIANGLE})
+        wait_for(lambda: recorder.robots == {"late"})
+        send(server, live(ARENA.messages(10)))
+        wait_for(lambda: writer.counts.get(KEYS.detections("cam0"), 0) == 10)
+        stop.set()
+        thread.join(DEADLINE_S)
+    assert read_recording(path).robots == {"late": TRIANGLE}
+    assert replay(path, out=tmp_path / "fused.mcap") == 0
 
 
 @pytest.mark.parametrize("is_link", [False, True])
