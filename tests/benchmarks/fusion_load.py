@@ -175,7 +175,7 @@ class Scene:
         seen = (-np.einsum("in,in->n", c, normal) > FACING * np.linalg.norm(c, axis=0)) & (c[2] > 0.1)
         seen &= rng.random(len(seen)) >= self.load.missing
         seen[:n] &= ~np.isin(self.marker_table.robot, list(hidden))
-        lens = self.load.rig[self.cameras.names[camera]]
+        lens = self.cameras[self.cameras.names[camera]]
         return self._noisy(lens, c[:, seen], normal[:, seen], row[seen], rng)
 
     def _noisy(self, lens: Camera, c, normal, row, rng: np.random.Generator) -> Roundels:

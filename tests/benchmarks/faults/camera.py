@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 import tyro
 
+from calib.rig.camera import Camera
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.foundation.arrays import Grey
@@ -109,12 +110,18 @@ class SceneCamera(Source):
         return delivered
 
     def place(self, fault: CameraFault) -> None:
-        """Set the faults, and the true pose of the camera."""
+        """Set the faults, and the true pose and focal length of the camera."""
         T, camera = np.eye(4), self._world.load.rig[self._name]
         T[:3, :3], T[:3, 3] = rotation_from_vector(np.array(fault.turn_rad)), fault.shift_m
-        moved = Pose.from_matrix(camera.matrix() @ T)
-        self._scene.cameras.place(self._name, msgspec.structs.replace(camera, T_world_cam=moved))
+        moved, scale = Pose.from_matrix(camera.matrix() @ T), fault.focal_scale
+        true = msgspec.structs.replace(camera, T_world_cam=moved, fx=camera.fx * scale, fy=camera.fy * scale)
+        self._scene.cameras.place(self._name, true)
         self.fault = fault
+
+    @property
+    def true_camera(self) -> Camera:
+        """The camera with its true pose and focal length."""
+        return self._scene.cameras[self._name]
 
     def close(self) -> None:
         self._closed.set()

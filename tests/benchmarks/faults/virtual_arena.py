@@ -12,8 +12,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from calib.rig.camera import Camera
 from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, decode, encode
+from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.server import Server
@@ -65,12 +67,23 @@ class VirtualArena:
         load: robots and cameras.
         seed: of the transit of messages.
         rig: the server's calibration, if it is not the true one.
+        robots: the server's robots, if they are not the true ones.
+        judge: the class that judges poses.
     """
 
-    def __init__(self, folder: Path, load: Load, seed: int = 1, rig: Rig | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        load: Load,
+        seed: int = 1,
+        rig: Rig | None = None,
+        robots: dict[str, Robot] | None = None,
+        judge: type[PoseJudge] = PoseJudge,
+    ) -> None:
         self.load, self.clock = load, VirtualClock()
         self.world = World(load, START_NS)
-        self.judge = PoseJudge(self.world, clock=self.clock)
+        self.judge = judge(self.world, clock=self.clock)
+        self._robots = load.bodies if robots is None else robots
         self.cameras = tuple(load.rig)
         self.status: FusionStatus | None = None
         self.camera_status: dict[str, CameraStatus] = {}
@@ -113,6 +126,10 @@ class VirtualArena:
         """Give a camera other faults."""
         self._sources[camera].place(fault)
 
+    def true_camera(self, name: str) -> Camera:
+        """A camera as it is by its faults."""
+        return self._sources[name].true_camera
+
     def cover(self, event: RobotEvent) -> None:
         """Cover a robot for a while."""
         self.world.events[event.robot] = event
@@ -134,7 +151,7 @@ class VirtualArena:
         self.server = self._server()
 
     def _server(self) -> Server:
-        bodies = {name: msgspec.to_builtins(body) for name, body in self.load.bodies.items()}
+        bodies = {name: msgspec.to_builtins(body) for name, body in self._robots.items()}
         rig, saved, robots = (str(self._folder / f"{file}.yaml") for file in ("rig", "saved_rig", "robots"))
         Path(robots).write_bytes(msgspec.yaml.encode({"robots": bodies}))
         server = Server(ArenaConfig(arena=ARENA, rig=rig, saved_rig=saved, robots=robots))

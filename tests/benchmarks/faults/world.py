@@ -60,6 +60,7 @@ class CameraFault(msgspec.Struct, frozen=True, kw_only=True):
         doubled: every frame arrives twice.
         step_ms, drift_ppm: errors of its clock.
         turn_rad, shift_m: its true pose differs from its calibrated pose by a motion in its own frame.
+        focal_scale: its true focal length over its calibrated one.
     """
 
     since_ns: int = 0
@@ -74,6 +75,7 @@ class CameraFault(msgspec.Struct, frozen=True, kw_only=True):
     drift_ppm: float = 0.0
     turn_rad: Vector = (0.0, 0.0, 0.0)
     shift_m: Vector = (0.0, 0.0, 0.0)
+    focal_scale: float = 1.0
 
     def stamp_ns(self, t_ns: int) -> int:
         """What the camera's clock shows at a time."""
