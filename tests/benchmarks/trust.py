@@ -176,8 +176,8 @@ def marker(mm: float) -> Kind:
         name = str(rng.choice(list(load.bodies)))
         first, *others = load.bodies[name].markers
         angle = rng.uniform(0, 2 * np.pi)
-        moved = (first[0] + 1e-3 * mm * np.cos(angle), first[1] + 1e-3 * mm * np.sin(angle), first[2])
-        robot = msgspec.structs.replace(load.bodies[name], markers=(moved, *others))
+        x, y = first[:2] + 1e-3 * mm * np.array([np.cos(angle), np.sin(angle)])
+        robot = msgspec.structs.replace(load.bodies[name], markers=((float(x), float(y), first[2]), *others))
         robots = {**load.bodies, name: robot}
         return Setting(Rig(cameras=load.rig), robots, guilty=frozenset({name}), in_files=True)
 
