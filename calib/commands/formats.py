@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`roundel calibrate import` and `roundel calibrate export`: recordings and rigs from and to other programs."""
 
+import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,6 +18,7 @@ from calib.formats import argus, caliscope, colmap, kalibr, multicamselfcal, ope
 from calib.formats.data import ForeignData, PixelOrigin, PointTable
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
+from calib.world.world_frame import scale_rig
 from camera_node.foundation.config import dump_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
@@ -25,15 +27,26 @@ Reader = Callable[[Sequence[Path], PixelOrigin], ForeignData]
 Writer = Callable[[Rig, Path, PixelOrigin], list[str]]
 FPS = 30  # in the printed command, for points without times; of synchronous cameras only the order of frames counts
 FormatName = Literal[
-    "argus", "easywand", "dltdv", "multicamselfcal", "caliscope", "opencv", "kalibr", "colmap"
+    "argus",
+    "easywand",
+    "dltdv",
+    "multicamselfcal",
+    "caliscope",
+    "anipose",
+    "pose2sim",
+    "opencv",
+    "ros",
+    "kalibr",
+    "tagslam",
+    "colmap",
 ]
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """How a format is read (None: export only) and written, and where it counts pixels from."""
+    """How a format is read and written, and where it counts pixels from."""
 
-    read: Reader | None
+    read: Reader
     write: Writer
     origin: PixelOrigin
 
@@ -44,9 +57,13 @@ FORMATS = {
     "dltdv": Format(argus.read, argus.write, argus.DLTDV8),
     "multicamselfcal": Format(multicamselfcal.read, multicamselfcal.write, multicamselfcal.FROM_ZERO),
     "caliscope": Format(caliscope.read, caliscope.write, caliscope.FROM_ZERO),
+    "anipose": Format(caliscope.read, caliscope.write_anipose, caliscope.FROM_ZERO),
+    "pose2sim": Format(caliscope.read, caliscope.write_anipose, caliscope.FROM_ZERO),
+    "ros": Format(opencv.read, opencv.write, opencv.FROM_ZERO),
+    "tagslam": Format(kalibr.read, kalibr.write, kalibr.FROM_ZERO),
     "opencv": Format(opencv.read, opencv.write, opencv.FROM_ZERO),
     "kalibr": Format(kalibr.read, kalibr.write, kalibr.FROM_ZERO),
-    "colmap": Format(None, colmap.write, colmap.FROM_ZERO),
+    "colmap": Format(colmap.read, colmap.write, colmap.FROM_ZERO),
 }
 
 
@@ -94,18 +111,21 @@ class ImportData(_Conversion):
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Its files; of MultiCamSelfCal the folder."""
+    unit_m: float = 1.0
+    """Metres of one unit of its positions: 0.001 where it calibrated in millimetres."""
 
     def run(self) -> None:
         """Read all files, then write; nothing is written if one of them is not usable."""
         chosen = FORMATS[self.format]
-        if chosen.read is None:
-            raise ConfigError(f"--format {self.format} can only be exported")
         if not self.files:
             raise ConfigError("give the files to import")
+        if not (math.isfinite(self.unit_m) and self.unit_m > 0):
+            raise ConfigError(f"--unit-m is {self.unit_m:g}; it must be above 0, in metres")
         data = chosen.read(self.files, self.origin(chosen))
         if not data.cameras and data.points is None:
             raise CalibrationError("the files have neither cameras nor points")
-        rig = make_rig(data.cameras) if data.cameras else None
+        rig = scale_rig(make_rig(data.cameras), self.unit_m) if data.cameras else None
+        data = replace(data, cameras=rig.cameras if rig else {})
         self.make_folder()
         if rig is not None:
             write_rig(rig, self.out / "rig.yaml")

@@ -6,7 +6,11 @@ aspect ratio fy / fx; Argus Clicker adds r2, r4, t1, t2, r6, which are OpenCV's 
 section "Wand", kilmoretrout/argus_gui docs/user-guide.md; easyWand: RGBsetup_profile.txt of PeppyHare/EasyWand).
 Points: columns `pt1_cam1_X, pt1_cam1_Y, pt1_cam2_X, ...`, NaN where a camera did not see a point, row k is frame k; the
 wand tables of easyWand have the same columns without names. DLTdv8 counts pixels from 1 at the top left, DLTdv5 to 7
-and Argus from 1 at the bottom left (tlhedrick/dltdv). DLT coefficients: `dltCoefs.csv`, 11 rows, one column a camera.
+and Argus from 1 at the bottom left (tlhedrick/dltdv). DLT coefficients: `dltCoefs.csv`, 11 rows, one column a camera:
+the world to undistorted pixels; they tell the direction of y, because worlds are right-handed.
+
+easyWand saves `*_easyWandData.mat`: a struct with imageWidth, imageHeight, focalLengths, ppts (or principalPoints),
+nlin, wandPts, wandLen and coefs (easyWand5.m, saveResultsButton_callback).
 """
 
 import csv
@@ -14,13 +18,25 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.formats.data import ForeignData, PixelOrigin, PointTable, make_camera, read_numbers, read_text
+from calib.formats.data import (
+    MAX_FILE_BYTES,
+    MAX_OFF_PX,
+    ForeignData,
+    PixelOrigin,
+    PointTable,
+    make_camera,
+    place_by_projection,
+    read_numbers,
+    read_text,
+)
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
+from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError
@@ -28,27 +44,155 @@ from camera_node.geometry.pose import invert
 
 DLTDV8, ARGUS = PixelOrigin(1), PixelOrigin(1, y_up=True)
 COLUMN = re.compile(r"\s*pt(\d+)_cam(\d+)_([xy])\s*", re.IGNORECASE)
+COEFFICIENTS = 11
+ASK = (
+    "y is counted from the top row, as DLTdv8 and easyWand do: for tables of DLTdv 5 to 7 give --y-up, or "
+    "dltCoefs.csv, which tells it"
+)
 EASYWAND_COLUMNS, CLICKER_COLUMNS, SBA_COLUMNS = 7, 12, 17
 MAX_NUMBER = 10_000  # of a point or a camera in a column's name
 
 
 def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
-    """Read a camera profile, tables of points, or both. Cameras are named cam1, cam2, ...
+    """Read a camera profile, a table of points, DLT coefficients, or the `.mat` of easyWand, which has all of them.
+    Cameras are named cam1, cam2, ...
 
     Raises:
         ConfigError, CalibrationError: a file is neither, or has impossible values.
     """
+    if saved := [path for path in paths if path.suffix.lower() == ".mat"]:
+        if len(paths) > 1:
+            raise ConfigError(f"{saved[0]} has cameras and points; give no other file")
+        return _read_saved(saved[0], origin)
     tables = [path for path in paths if path.suffix.lower() == ".csv"]
+    coefficients = [path for path in tables if "dlt" in path.stem.lower()]
+    tables = [path for path in tables if path not in coefficients]
     cameras: dict[str, Camera] = {}
     for path in paths:
-        if path not in tables:
+        if path not in tables and path not in coefficients:
             cameras |= _read_profile(path)
     if len(tables) > 1:
         raise ConfigError(
             f"{len(tables)} tables of points; import one after the other, each with its own --out"
         )
+    remarks: tuple[str, ...] = ()
+    if coefficients:
+        cameras, origin, remarks = _place(cameras, _read_coefficients(coefficients[0], cameras), origin)
+    elif tables and not origin.y_up:
+        remarks = (ASK,)
     points = _read_points(tables[0], cameras, origin) if tables else None
-    return ForeignData(cameras, points)
+    return ForeignData(cameras, points, remarks=remarks)
+
+
+def _read_coefficients(path: Path, cameras: Mapping[str, Camera]) -> Array:
+    """(C, 3, 4) projection matrices."""
+    rows = read_numbers(path)
+    if len(rows) != COEFFICIENTS or any(len(row) != len(cameras) for row in rows):
+        raise ConfigError(
+            f"{path} needs {COEFFICIENTS} rows of {len(cameras)} numbers, one column for each camera of the profile"
+        )
+    return _projections(np.array(rows))
+
+
+def _projections(coefficients: Array) -> Array:
+    """(C, 3, 4) projection matrices from (11, C) coefficients."""
+    return np.vstack([coefficients, np.ones(coefficients.shape[1])]).T.reshape(-1, 3, 4)
+
+
+def _place(
+    cameras: Mapping[str, Camera], P: Array, origin: PixelOrigin
+) -> tuple[dict[str, Camera], PixelOrigin, tuple[str, ...]]:
+    """The cameras at the poses of their projections (C, 3, 4), and the origin with the direction of y that these show.
+
+    A projection is from a right-handed world: its determinant is negative where y is counted upwards.
+    """
+    up = int((np.linalg.det(P[:, :, :3]) < 0).sum())
+    if up not in (0, len(P)):
+        raise CalibrationError("the DLT coefficients of some cameras are mirrored against those of others")
+    found = PixelOrigin(origin.first, y_up=up > 0)
+    placed = {}
+    for (name, camera), projection in zip(cameras.items(), P, strict=True):
+        back = np.eye(3)
+        corners = found.read(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), camera.height)
+        back[:2, 2], back[:2, :2] = corners[0], (corners[1:] - corners[0]).T
+        placed[name], off = place_by_projection(
+            camera, back @ projection, f"the DLT coefficients of '{name}'"
+        )
+        if off > MAX_OFF_PX:
+            raise CalibrationError(
+                f"the lens and the DLT coefficients of camera '{name}' differ by up to {off:.0f} px; give the profile "
+                "that belongs to them"
+            )
+    which = "the lowest" if found.y_up else "the top"
+    changed = found.y_up != origin.y_up
+    return placed, found, (f"the DLT coefficients count y from {which} row",) if changed else ()
+
+
+def _read_saved(path: Path, origin: PixelOrigin) -> ForeignData:
+    """The cameras, poses, points and wand of a `.mat` file of easyWand."""
+    saved = _load_matlab(path)
+    try:
+        focal = np.ravel(np.asarray(saved.focalLengths, float))
+        centres = np.asarray(getattr(saved, "ppts", getattr(saved, "principalPoints", None)), float).reshape(
+            -1, 2
+        )
+        width, height = (
+            np.broadcast_to(np.ravel(np.asarray(value, float)), len(focal))
+            for value in (saved.imageWidth, saved.imageHeight)
+        )
+        distortion = np.asarray(getattr(saved, "nlin", np.zeros((len(focal), 0))), float).reshape(
+            len(focal), -1
+        )
+        table = np.asarray(saved.wandPts, float).reshape(-1, 4 * len(focal))
+        coefficients = np.asarray(getattr(saved, "coefs", np.zeros((0, 0))), float)
+        length = float(saved.wandLen)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{path} is not a result of easyWand: {error}; import its profile and tables"
+        ) from None
+    if len(centres) != len(focal) or distortion.shape[1] not in (0, 5):
+        raise ConfigError(f"{path}: focalLengths, ppts and nlin are not of the same cameras; save it again")
+    cameras = {}
+    for k, f in enumerate(focal.tolist(), 1):
+        cx, cy = centres[k - 1].tolist()
+        lens = {"fx": f, "fy": f, "cx": cx, "cy": cy, "distortion": tuple(distortion[k - 1].tolist())}
+        cameras[f"cam{k}"] = make_camera(width[k - 1], height[k - 1], **lens)
+    remarks: tuple[str, ...] = () if origin.y_up else (ASK,)
+    if coefficients.shape == (COEFFICIENTS, len(focal)) and np.isfinite(coefficients).all():
+        cameras, origin, remarks = _place(cameras, _projections(coefficients), origin)
+    try:
+        wand = WandBody(markers=((0.0, 0.0, 0.0), (length, 0.0, 0.0)))
+    except ValueError as error:
+        raise CalibrationError(f"{path}: wandLen: {error}") from None
+    points = _collect(table, _number_columns(path, table.shape[1], len(cameras)), cameras, origin)
+    return ForeignData(cameras, points, wand, remarks)
+
+
+def _load_matlab(path: Path) -> Any:
+    """The struct easyWandData.
+
+    Raises:
+        ConfigError: the file is no such file of MATLAB, or one of version 7.3.
+    """
+    from scipy.io import loadmat
+
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise ConfigError(f"{path} has more than {MAX_FILE_BYTES} bytes; is it the right file?")
+        found = loadmat(
+            path, squeeze_me=True, struct_as_record=False, variable_names=["easyWandData"], appendmat=False
+        )
+        return found["easyWandData"]
+    except ConfigError:
+        raise
+    except NotImplementedError:
+        raise ConfigError(f"{path} is of version 7.3 of MATLAB's format; save it with save -v7") from None
+    except OSError as error:
+        raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
+    except Exception as error:  # scipy raises whatever a damaged file leads to
+        raise ConfigError(
+            f"{path} is not a result of easyWand: {type(error).__name__}; save it again"
+        ) from None
 
 
 def _read_profile(path: Path) -> dict[str, Camera]:

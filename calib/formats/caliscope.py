@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Caliscope (mprib/caliscope): `camera_array.toml`, or `config.toml` of older versions, and `xy.csv`.
+"""Caliscope (mprib/caliscope): `camera_array.toml`, or `config.toml` of older versions, and `xy.csv`; and cameras of
+Anipose (`calibration.toml`) and Pose2Sim (`Calib.toml`), which have the same fields and a name in each table.
 
 Cameras: tables `[cameras.0]`, or `[cam_0]`, with size, matrix, distortions, fisheye, and rotation (3 x 3 or Rodrigues
 vector) and translation from the world to the camera (src/caliscope/persistence.py, save_camera_array). Points: columns
@@ -24,7 +25,7 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array, Index
-from camera_node.foundation.config import write_atomically
+from camera_node.foundation.config import is_name, write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector, vector_from_rotation
 
@@ -82,19 +83,32 @@ def _read_cameras(path: Path) -> dict[str, Camera]:
         data = tomllib.loads(read_text(path))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from None
-    tables = data.get("cameras") or {k[4:]: v for k, v in data.items() if k.startswith("cam_")}
+    tables = data.get("cameras") or {
+        k: v for k, v in data.items() if isinstance(v, Mapping) and (k.startswith("cam_") or "matrix" in v)
+    }
     if not isinstance(tables, Mapping) or not tables:
         raise ConfigError(f"{path} has no tables [cameras.0] or [cam_0]")
     cameras = {}
     for number, entry in tables.items():
         if not isinstance(entry, Mapping) or not entry.get("ignore", False):
             try:
-                cameras[f"cam{number}"] = _build(entry)
+                name = _name(number, entry)
+                if name in cameras:
+                    raise ConfigError(f"{path} has two cameras '{name}'; rename one")
+                cameras[name] = _build(entry)
             except (CalibrationError, KeyError, TypeError, ValueError, IndexError) as error:
                 raise ConfigError(
                     f"{path}: camera {number} has no usable size, matrix or pose: {error}"
                 ) from None
     return cameras
+
+
+def _name(key: str, entry: Mapping[str, Any]) -> str:
+    """The name that a table states, else that of its key: cam0 of 0 and cam_0."""
+    if is_name(stated := str(entry.get("name", ""))):
+        return stated
+    key = key.removeprefix("cam_")
+    return f"cam{key}" if key.isdigit() or not is_name(key) else key
 
 
 def _build(entry: Mapping[str, Any]) -> Camera:
@@ -235,14 +249,29 @@ def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
     """
     if origin != FROM_ZERO:
         raise CalibrationError("Caliscope counts pixels as OpenCV; leave out --first-pixel and --y-up")
-    return _write_tables(
-        folder, [_table(k, name, camera) for k, (name, camera) in enumerate(rig.cameras.items())]
-    )
-
-
-def _write_tables(folder: Path, tables: Sequence[str]) -> list[str]:
+    tables = [_table(k, name, camera) for k, (name, camera) in enumerate(rig.cameras.items())]
     write_atomically(folder / "camera_array.toml", "\n".join(tables))
     return ["camera_array.toml"]
+
+
+def write_anipose(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
+    """Write `calibration.toml` of Anipose and Pose2Sim, in metres; return its name.
+
+    Raises:
+        CalibrationError: the pixel origin is another than OpenCV's, or a camera has no pose.
+    """
+    if origin != FROM_ZERO:
+        raise CalibrationError("Anipose counts pixels as OpenCV; leave out --first-pixel and --y-up")
+    if bare := [name for name, camera in rig.cameras.items() if camera.T_world_cam is None]:
+        raise CalibrationError(f"camera '{bare[0]}' has no pose; run roundel calibrate wand, or leave it out")
+    tables = []
+    for k, (name, camera) in enumerate(rig.cameras.items()):
+        table = _table(k, name, camera).splitlines()[2:]
+        kept = [line for line in table if not line.startswith(("cam_id", "rotation_count", "ignore"))]
+        tables.append("\n".join([f"[cam_{k}]", f'name = "{name}"', *kept]) + "\n")
+    tables.append("[metadata]\nadjusted = false\nerror = 0.0\n")
+    write_atomically(folder / "calibration.toml", "\n".join(tables))
+    return ["calibration.toml"]
 
 
 def _table(number: int, name: str, camera: Camera) -> str:

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""OpenCV's camera files (YAML of `cv::FileStorage`) and ROS's `camera_info`, one file a camera.
+"""OpenCV's camera files (YAML of `cv::FileStorage`) and ROS's `camera_info`, one file a camera; and OpenCV's multi-view
+calibration, one file for all.
 
 Matrices are mappings with rows, cols and data, with or without the tag `!!opencv-matrix`. Names: camera_matrix (also
 cameraMatrix, K, M1), distortion_coefficients (also distCoeffs, D), image_width and image_height (also image_size), and
-in ROS camera_name and distortion_model (samples/cpp/calibration.cpp of OpenCV; camera_calibration_parsers of ROS).
+in ROS camera_name and distortion_model (samples/cpp/calibration.cpp of OpenCV; camera_calibration_parsers of ROS). A
+message that `rostopic echo` or `ros2 topic echo` prints has K and D, or k and d, as lists.
+
+Multi-view (samples/python/multiview_calibration.py of OpenCV 5): Ks (C, 3, 3), distortions (C, n), rvecs and Ts (C, 3)
+from the first camera into each, image_sizes (C, 2), is_fisheye (C,) and cam_ids, names with commas.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,28 +20,42 @@ import cv2
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.formats.data import ForeignData, PixelOrigin, make_camera
+from calib.formats.data import ForeignData, PixelOrigin, make_camera, read_text
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
-from camera_node.foundation.config import is_name, read_yaml, write_atomically
+from camera_node.foundation.config import is_name, parse_yaml, read_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import invert
+from camera_node.geometry.pose import Pose, invert, rotation_from_vector
 
 FROM_ZERO = PixelOrigin(0)
-MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M", "M1", "intrinsic_matrix")
-DISTORTION = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D", "D1")
+MULTIVIEW = ("Ks", "distortions", "rvecs", "Ts", "image_sizes", "is_fisheye", "cam_ids")
+BLOCK = re.compile(r"^(\w+):.*\n(?:[ \t].*\n|\n)*", re.MULTILINE)
+MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "M", "M1", "intrinsic_matrix")
+DISTORTION = (
+    "distortion_coefficients",
+    "distCoeffs",
+    "dist_coeffs",
+    "Distortion_Coefficients",
+    "D",
+    "d",
+    "D1",
+)
 FISHEYE = ("fisheye", "equidistant")
 PINHOLE = ("", "plumb_bob", "rational_polynomial", "pinhole")
 
 
 def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
-    """Read one camera from each file; it has the name that the file states, else that of the file.
+    """Read one camera from each file; it has the name that the file states, else that of the file. A file of a
+    multi-view calibration has all cameras.
 
     Raises:
         ConfigError, CalibrationError: a file is not such a file, or has impossible values.
     """
     cameras = {}
     for path in paths:
+        if (blocks := _multiview_blocks(read_text(path))) is not None:
+            cameras |= _read_multiview(path, parse_yaml(blocks.encode(), path, foreign=True))
+            continue
         data = read_yaml(path, foreign=True)
         if not isinstance(data, Mapping):
             raise ConfigError(f"{path} is not a camera file of OpenCV or ROS")
@@ -45,6 +65,51 @@ def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
             raise ConfigError(f"{path}: camera '{name}' was already in another file; rename one")
         cameras[name] = _build(path, data, origin)
     return ForeignData(cameras)
+
+
+def _multiview_blocks(text: str) -> str | None:
+    """The part of a file of a multi-view calibration that has the cameras; None of another file."""
+    blocks = {match[1]: match[0] for match in BLOCK.finditer(text + "\n") if match[1] in MULTIVIEW}
+    return "".join(blocks.values()) if "Ks" in blocks else None
+
+
+def _read_multiview(path: Path, data: Any) -> dict[str, Camera]:
+    names = [name.strip() for name in str(data.get("cam_ids", "")).split(",") if name.strip()]
+    arrays = {}
+    for key in MULTIVIEW[:-1]:
+        value = data.get(key)
+        try:
+            numbers = value["data"] if isinstance(value, Mapping) else value
+            arrays[key] = np.array([float(number) for number in numbers])
+        except (KeyError, TypeError, ValueError):
+            raise ConfigError(
+                f"{path} lacks the matrix {key}, or it is not numbers; write the file again"
+            ) from None
+    count = len(arrays["Ks"]) // 9
+    if not count or any(not len(a) or len(a) % count for a in arrays.values()):
+        raise ConfigError(
+            f"{path}: its matrices are not those of one number of cameras; write the file again"
+        )
+    K, distortions, turns, shifts, sizes, fisheye = (a.reshape(count, -1) for a in arrays.values())
+    if turns.shape[1] != 3 or shifts.shape[1] != 3 or sizes.shape[1] != 2:
+        raise ConfigError(f"{path}: rvecs and Ts need 3 numbers a camera, and image_sizes 2")
+    if not all(np.isfinite(a).all() for a in arrays.values()):
+        raise ConfigError(f"{path}: a number is not finite; calibrate again")
+    if len(names) != count or len(set(names)) != count:
+        names = [f"cam{k}" for k in range(count)]
+    cameras = {}
+    for k, name in enumerate(names):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = rotation_from_vector(turns[k]), shifts[k]
+        of_model = distortions[k][:4] if fisheye[k, 0] else distortions[k]
+        cameras[name] = make_camera(
+            *sizes[k],
+            **dict(zip(("fx", "cx", "fy", "cy"), K[k][[0, 2, 4, 5]].tolist(), strict=True)),
+            distortion=tuple(of_model.tolist()),
+            model="fisheye" if fisheye[k, 0] else "pinhole",
+            T_world_cam=Pose.from_matrix(invert(T)),
+        )
+    return cameras
 
 
 def _build(path: Path, data: Mapping[str, Any], origin: PixelOrigin) -> Camera:

@@ -28,7 +28,8 @@ MAX_VALUES = 100_000  # about 1 kB of memory each while a file is read
 # libyaml reads ahead of its events by at most 1024 characters of a line, and refuses 1000 levels: that many brackets in
 # 1024 characters have a run of 40.
 DEEP_RUN = re.compile(rb"[\[{]{%d}" % (MAX_DEPTH + 1))
-OPENCV_SYNTAX = re.compile(rb"\A%YAML:1\.0[^\n]*\n|!!opencv-matrix")
+OPENCV_SYNTAX = re.compile(rb"\A%YAML:1\.0[^\n]*\n|!!opencv-(?:nd-)?matrix")
+FOREIGN_END = re.compile(rb"\n---\s*\Z")  # after a message that ROS prints
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -180,9 +181,13 @@ def read_yaml(path: Path, foreign: bool = False) -> Any:
         ConfigError: the file is missing, not a regular file, too large, or not YAML; or it uses tags, or has a key
             twice. Aliases may be used; their values count each time.
     """
-    text = _read_bounded(path)
+    return parse_yaml(_read_bounded(path), path, foreign)
+
+
+def parse_yaml(text: bytes, path: Path, foreign: bool = False) -> Any:
+    """The content of a YAML text that was read from a file; see `read_yaml`."""
     if foreign:
-        text = OPENCV_SYNTAX.sub(b"", text)
+        text = FOREIGN_END.sub(b"\n", OPENCV_SYNTAX.sub(b"", text))
     try:
         _require_bounded(text)
         loader = _Loader(text)

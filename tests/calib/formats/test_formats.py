@@ -11,12 +11,13 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+import scipy.io
 import tyro
 
 from calib.commands.calibrate_wand import Wand
 from calib.commands.formats import FORMATS, ExportRig, FormatName, ImportData, make_rig
 from calib.errors import CalibrationError
-from calib.formats.data import ForeignData, with_coefficients
+from calib.formats.data import ForeignData, PixelOrigin, with_coefficients
 from calib.rig.camera import transform
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.rig.wand_file import WandBody
@@ -127,14 +128,12 @@ def read(name: FormatName, folder: Path, files: dict[str, str]) -> ForeignData:
         (folder / file).write_text(text)
     paths = [folder] if name == "multicamselfcal" else [folder / file for file in files]
     chosen = FORMATS[name]
-    assert chosen.read is not None
     return chosen.read(paths, chosen.origin)
 
 
 def read_folder(name: FormatName, folder: Path) -> ForeignData:
     """Read the files that are in a folder already."""
     chosen = FORMATS[name]
-    assert chosen.read is not None
     return chosen.read([folder], chosen.origin)
 
 
@@ -371,7 +370,6 @@ def test_recordings_of_others_open_unedited(name: FormatName, folder, files, cam
     if not (DATA / folder).is_dir():
         pytest.skip(f"{DATA / folder} is absent")
     chosen = FORMATS[name]
-    assert chosen.read is not None
     data = chosen.read([DATA / folder / file for file in files], chosen.origin)
     assert (len(data.cameras), len(data.points or [])) == (cameras, points)
 
@@ -391,6 +389,35 @@ def test_opencv_and_ros_files(tmp_path: Path):
     assert list(cameras) == ["north", "head_left"]
     assert cameras["north"].parameters.tolist() == cameras["head_left"].parameters.tolist()
     assert cameras["north"].parameters.tolist() == [520, 521, 320.5, 239.5, -0.12, 0.04, 0, 0, 0.001]
+
+
+ANIPOSE = """[cam_0]
+name = "A"
+size = [640, 480]
+matrix = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+distortions = [-0.1, 0.0, 0.0, 0.0, 0.0]
+rotation = [0.0, 0.0, 0.0]
+translation = [0.0, 0.0, 250.0]
+
+[cam_1]
+name = "B"
+size = [640, 480]
+matrix = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+distortions = [-0.1, 0.0, 0.0, 0.0, 0.0]
+rotation = [0.0, 1.5707963267948966, 0.0]
+translation = [0.0, 0.0, 250.0]
+
+[metadata]
+adjusted = false
+error = 0.21
+"""
+POSE2SIM = (
+    ANIPOSE.replace("[cam_0]", "[int_cam1_img]")
+    .replace('"A"', '"int_cam1_img"')
+    .replace(
+        "distortions = [-0.1, 0.0, 0.0, 0.0, 0.0]", "distortions = [-0.1, 0.0, 0.0, 0.0]\nfisheye = false"
+    )
+)
 
 
 BROKEN = {
@@ -489,6 +516,8 @@ SAMPLES: dict[str, tuple[FormatName, str, str]] = {
     "xy": ("caliscope", "xy.csv", XY),
     "camchain": ("kalibr", "a.yaml", CAMCHAIN),
     "opencv": ("opencv", "a.yaml", OPENCV),
+    "anipose": ("anipose", "a.toml", ANIPOSE),
+    "colmap": ("colmap", "cameras.txt", "1 OPENCV 640 480 500 500 320 240 -0.1 0 0 0\n"),
     "points": ("multicamselfcal", "points.dat", "1 2\n11 12\n1 1\n5.5 6.5\n15 16\n1 1\n"),
 }
 MUTATIONS = ("nan", "inf", "-1", "1e308", "9" * 30, "", "[", "{}", "null", "x", ",", "\n", "\0", "true")
@@ -512,7 +541,7 @@ def test_a_mutated_file_is_read_or_refused(tmp_path: Path, sample: str):
                 data.points.write(tmp_path / "o.out")
 
 
-@pytest.mark.parametrize("name", [name for name, form in FORMATS.items() if form.read is not None])
+@pytest.mark.parametrize("name", FORMATS)
 def test_an_exported_rig_is_read_back(tmp_path: Path, name: FormatName):
     """Pixels of the markers in all cameras are equal; poses too, where the format has them: Argus has only DLT
     coefficients."""
@@ -530,13 +559,181 @@ def test_an_exported_rig_is_read_back(tmp_path: Path, name: FormatName):
     by_focal = sorted(back.cameras.values(), key=lambda camera: camera.fx)
     for found, camera in zip(by_focal, truth.cameras.values(), strict=True):
         assert found.project(ahead) == pytest.approx(camera.project(ahead), abs=1e-3)
-    if name in ("multicamselfcal", "caliscope"):
+    if name in ("multicamselfcal", "caliscope", "anipose", "pose2sim", "colmap"):
         assert camera_errors(back, truth)[0].max() < 1e-9
         assert by_focal[1].matrix() == pytest.approx(truth.cameras["cam1"].matrix(), abs=1e-9)
-    elif name == "kalibr":
+    elif name in ("kalibr", "tagslam"):
         assert camera_errors(back, truth)[0].max() < 1e-9
     else:
         assert not back.placed()
+
+
+def test_cameras_of_anipose_in_millimetres(tmp_path: Path):
+    (tmp_path / "calibration.toml").write_text(ANIPOSE)
+    files = (tmp_path / "calibration.toml",)
+    ImportData(format="anipose", files=files, out=tmp_path / "in", unit_m=0.001).run()
+    rig = load_rig(tmp_path / "in" / "rig.yaml")
+    assert list(rig.cameras) == ["A", "B"]
+    assert rig.cameras["A"].matrix()[:3, 3] == pytest.approx([0, 0, -0.25])
+    assert rig.cameras["B"].matrix()[:3, 3] == pytest.approx([0.25, 0, 0])
+    with pytest.raises(ConfigError, match="--unit-m is 0"):
+        ImportData(format="anipose", files=files, out=tmp_path / "in", unit_m=0.0).run()
+
+
+def test_cameras_of_pose2sim(tmp_path: Path):
+    cameras = read("pose2sim", tmp_path, {"Calib.toml": POSE2SIM}).cameras
+    assert list(cameras) == ["int_cam1_img", "B"]
+    assert cameras["int_cam1_img"].distortion == (-0.1, 0, 0, 0)
+
+
+TOPIC = """header:
+  seq: 7
+  stamp: {secs: 1, nsecs: 2}
+  frame_id: "left"
+height: 480
+width: 640
+distortion_model: "plumb_bob"
+D: [-0.12, 0.04, 0.0, 0.0, 0.001]
+K: [520.0, 0.0, 320.5, 0.0, 521.0, 239.5, 0.0, 0.0, 1.0]
+R: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+P: [520.0, 0.0, 320.5, 0.0, 0.0, 521.0, 239.5, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+---
+"""
+
+
+def test_messages_that_ros_prints(tmp_path: Path):
+    """ROS 1 has K and D, ROS 2 has k and d; --- follows each message."""
+    second = TOPIC.replace("K:", "k:").replace("D:", "d:")
+    cameras = read("ros", tmp_path, {"left.yaml": TOPIC, "right.yaml": second}).cameras
+    for camera in cameras.values():
+        assert camera.parameters.tolist() == [520, 521, 320.5, 239.5, -0.12, 0.04, 0, 0, 0.001]
+
+
+def write_multiview(path: Path, truth: Rig, fisheye: int = 0) -> None:
+    """Write what OpenCV 5's samples/python/multiview_calibration.py writes, with the images of a large board."""
+    cameras, storage = list(truth.cameras.values()), cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    to_camera = [invert(camera.matrix()) @ cameras[0].matrix() for camera in cameras]
+    storage.write("rvecs", np.array([cv2.Rodrigues(T[:3, :3])[0] for T in to_camera]))
+    storage.write("distortions", np.array([[camera.distortion[:5]] for camera in cameras]))
+    storage.write("Ks", np.array([camera.K for camera in cameras]))
+    storage.write("Ts", np.array([T[:3, 3:] for T in to_camera]))
+    storage.write("image_points", np.zeros((len(cameras), 200, 100, 2)))
+    storage.write("is_fisheye", np.array([fisheye] * len(cameras)))
+    storage.write("image_sizes", np.array([[camera.width, camera.height] for camera in cameras]))
+    storage.write("cam_ids", ",".join(truth.cameras))
+    storage.release()
+
+
+def test_a_multiview_calibration_of_opencv(tmp_path: Path):
+    """All cameras in one file, the first is the world; the images in it are more than what a camera file may have."""
+    truth = ring(3).truth
+    write_multiview(tmp_path / "multi.yaml", truth)
+    back = make_rig(read("opencv", tmp_path, {"multi.yaml": (tmp_path / "multi.yaml").read_text()}).cameras)
+    assert list(back.cameras) == list(truth.cameras)
+    assert camera_errors(back, truth)[0].max() < 1e-9
+    for name, camera in truth.cameras.items():
+        assert back.cameras[name].parameters == pytest.approx(camera.parameters)
+    broken = (tmp_path / "multi.yaml").read_text().replace("rvecs:", "turns:")
+    with pytest.raises(ConfigError, match="lacks the matrix rvecs"):
+        read("opencv", tmp_path, {"multi.yaml": broken})
+
+
+def test_a_colmap_model_of_one_lens_for_two_images(tmp_path: Path):
+    """An image without points has an empty line; a binary model is named with the command that converts it."""
+    files = {
+        "cameras.txt": "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 SIMPLE_RADIAL 640 480 500 320.5 240.5 -0.1\n",
+        "images.txt": "# IMAGE_ID, ...\n1 1 0 0 0 0 0 2 1 north.png\n\n2 1 0 0 0 1 0 2 1 b/south.jpg\n3.5 4.5 -1\n",
+    }
+    data = read("colmap", tmp_path, files)
+    assert list(data.cameras) == ["north", "south"]
+    assert data.cameras["south"].matrix()[:3, 3].tolist() == [-1, 0, -2]
+    assert data.cameras["north"].parameters.tolist() == [500, 500, 320, 240, -0.1, 0, 0, 0]
+    assert "--unit-m" in data.remarks[0]
+    (tmp_path / "bin").mkdir()
+    with pytest.raises(ConfigError, match="colmap model_converter"):
+        read_folder("colmap", tmp_path / "bin")
+
+
+def write_easywand(folder: Path, y_up: bool, **changes) -> Rig:
+    """Write a `.mat` as easyWand 5 saves it, and return the true rig."""
+    write_stick(folder, "argus" if y_up else "easywand")
+    cameras = {
+        n: c.with_parameters([c.fx, c.fx, *c.parameters[2:]]) for n, c in ring(3).truth.cameras.items()
+    }
+    truth = Rig(cameras={f"cam{k}": camera for k, camera in enumerate(cameras.values(), 1)})
+    FORMATS["argus"].write(truth, folder, PixelOrigin(1, y_up))
+    placed = list(truth.cameras.values())
+    data = {
+        "version": 5.7,
+        "wandLen": LENGTH_M,
+        "imageWidth": np.array([c.width for c in placed], float),
+        "imageHeight": np.array([c.height for c in placed], float),
+        "focalLengths": np.array([c.fx for c in placed]),
+        "ppts": np.array([[x for c in placed for x in (c.cx, c.cy)]]),
+        "nlin": np.array([c.distortion for c in placed]),
+        "wandPts": np.loadtxt(folder / "xypts.csv", delimiter=",", skiprows=1),
+        "coefs": np.loadtxt(folder / "dltCoefs.csv", delimiter=","),
+        "handles": np.zeros((0, 0)),
+    }
+    scipy.io.savemat(folder / "run_easyWandData.mat", {"easyWandData": {**data, **changes}})
+    return truth
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+def test_a_mat_file_of_easywand_has_everything_and_tells_the_direction_of_y(
+    tmp_path: Path, capsys, y_up: bool
+):
+    truth = write_easywand(tmp_path, y_up)
+    files = (tmp_path / "run_easyWandData.mat",)
+    words = printed_command(capsys, ImportData(format="easywand", files=files, out=tmp_path / "in"))
+    imported = load_rig(tmp_path / "in" / "rig.yaml")
+    assert camera_errors(imported, truth)[0].max() < 1e-6
+    tyro.cli(Wand, args=words).run()
+    assert camera_errors(load_rig(tmp_path / "in" / "calibrated.yaml"), truth)[0].max() < 0.01
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+def test_dlt_coefficients_tell_the_direction_of_y(tmp_path: Path, y_up: bool):
+    truth = write_easywand(tmp_path, y_up)
+    names = ("profile.txt", "xypts.csv", "dltCoefs.csv")
+    with_coefficients = read("dltdv", tmp_path, {name: (tmp_path / name).read_text() for name in names})
+    assert camera_errors(make_rig(with_coefficients.cameras), truth)[0].max() < 1e-6
+    points = with_coefficients.points
+    assert points is not None
+    alone = read("argus" if y_up else "dltdv", tmp_path, {n: (tmp_path / n).read_text() for n in names[:2]})
+    assert alone.points is not None
+    assert points.uv == pytest.approx(alone.points.uv)
+    assert bool(alone.remarks) is not y_up
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"focalLengths": np.array([1.0, 2.0])}, "not a result of easyWand|not of the same cameras"),
+        ({"wandPts": np.full((4, 12), np.nan)}, "has no points"),
+        ({"wandLen": np.nan}, "wandLen"),
+        ({"imageWidth": np.array([np.nan] * 3)}, "NaN"),
+    ],
+)
+def test_a_mat_file_with_impossible_values_is_refused(tmp_path: Path, changes, fault: str):
+    write_easywand(tmp_path, False, **changes)
+    chosen = FORMATS["easywand"]
+    with pytest.raises((ConfigError, CalibrationError), match=fault):
+        chosen.read([tmp_path / "run_easyWandData.mat"], chosen.origin)
+
+
+def test_a_damaged_mat_file_is_refused(tmp_path: Path):
+    write_easywand(tmp_path, False)
+    path, chosen = tmp_path / "run_easyWandData.mat", FORMATS["easywand"]
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(60):
+        damaged = bytearray(whole)
+        for at in rng.integers(128, len(whole), 4):
+            damaged[at] = rng.integers(256)
+        path.write_bytes(bytes(damaged[: rng.integers(200, len(whole))]))
+        with contextlib.suppress(ConfigError, CalibrationError):
+            chosen.read([path], chosen.origin)
 
 
 def test_exported_opencv_files_are_read_by_opencv(tmp_path: Path):
