@@ -26,6 +26,7 @@ from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_from_vector, skew
 
 MIN_MARKERS = 4  # of a view, that give the body's pose
+MAX_VIEW = 32  # of a view, that are used to locate it
 FLAT = 0.01  # of the extent of points: those nearer to a line or a plane lie on it
 SIGMA_RAD = 1.5e-3  # of a ray to a marker by a rough rig: 3 px of a lens of 2000 px
 GATE_RAD = 5 * SIGMA_RAD  # a ray farther from its marker is an outlier
@@ -169,7 +170,7 @@ class BodyLocator:
         parts = []
         for k in sorted(self.poses):
             xy = np.array([track.interpolate(t_s - self.offset_s[k], self.gap_s) for track in self.tracks[k]])
-            marker, instant = np.nonzero(np.isfinite(xy[..., 0]))
+            marker, instant = _thin(*np.nonzero(np.isfinite(xy[..., 0])))
             parts.append(_Views(instant, np.full(len(marker), k), marker, xy[marker, instant]))
         views = _Views(
             *(np.concatenate([getattr(part, name) for part in parts]) for name in _Views.__slots__)
@@ -235,6 +236,19 @@ class BodyLocator:
                 break
             best, least = np.where(better[:, None, None], moved, best), np.where(better, costs, least)
         return best, least
+
+
+def _thin(marker: Index, instant: Index) -> tuple[Index, Index]:
+    """Markers (n,) and their instants (n,), of each instant at most `MAX_VIEW`, evenly."""
+    order = np.lexsort((marker, instant))
+    marker, instant = marker[order], instant[order]
+    first = np.flatnonzero(np.diff(instant, prepend=-1))
+    count = np.repeat(np.diff(first, append=len(instant)), np.diff(first, append=len(instant)))
+    rank = np.arange(len(instant)) - np.repeat(first, np.diff(first, append=len(instant)))
+    kept = (rank * MAX_VIEW // np.maximum(count, MAX_VIEW)) != (
+        (rank - 1) * MAX_VIEW // np.maximum(count, MAX_VIEW)
+    )
+    return marker[kept], instant[kept]
 
 
 def _repeat(of_row: Index, of_pose: Index) -> tuple[Index, Index]:

@@ -273,8 +273,8 @@ class MarkerTrack:
         except at the track's own timestamps."""
         if not len(self.t_s):
             return np.full((*t_s.shape, 2), np.nan)
-        if len(self.t_s) == 1:
-            return np.where(np.abs(t_s - self.t_s[0])[..., None] < SAME_S, self.xy[0], np.nan)
+        if len(self.t_s) == 1 or not gap_s:
+            return self._at_own(t_s)
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         tau, dt = t_s - self.t_s[after - 1], self.t_s[after] - self.t_s[after - 1]
         inside = (tau >= -SAME_S) & (tau <= dt + SAME_S) & (dt <= gap_s)
@@ -285,23 +285,32 @@ class MarkerTrack:
         found += h[..., 2:3] * p[after] + h[..., 3:] * v[after]
         return np.where(inside[..., None], found, np.nan)
 
+    def _at_own(self, t_s: Array) -> Array:
+        """Positions (..., 2) at timestamps (...) that are the track's own; NaN at others."""
+        k = np.searchsorted(self.t_s, t_s - SAME_S)
+        k = np.minimum(k, len(self.t_s) - 1)
+        return np.where(np.abs(t_s - self.t_s[k])[..., None] < SAME_S, self.xy[k], np.nan)
+
 
 def build_tracks(detections: WandDetections, cameras: int, markers: int) -> list[list[MarkerTrack]]:
     """Return tracks by camera and marker, in undistorted image plane coordinates, by timestamps."""
-    tracks = []
-    for camera in range(cameras):
-        mine = detections.camera == camera
-        rows = [np.flatnonzero(mine & (detections.label == marker)) for marker in range(markers)]
-        tracks.append([MarkerTrack.of(detections.t_s[k], detections.xy[k]) for k in rows])
-    return tracks
+    rows = group_rows(detections.camera * markers + detections.label, cameras * markers)
+    tracks = [MarkerTrack.of(detections.t_s[k], detections.xy[k]) for k in rows]
+    return [tracks[camera * markers : (camera + 1) * markers] for camera in range(cameras)]
+
+
+def group_rows(number: Index, count: int) -> list[Index]:
+    """The rows of each number below `count` among numbers (n,), ascending."""
+    order = np.argsort(number, kind="stable")
+    return np.split(order, np.searchsorted(number[order], np.arange(1, count)))
 
 
 def interpolate(tracks: Sequence[MarkerTrack], label: Index, t_s: Array, gap_s: float) -> Array:
     """Return positions (..., n, 2) of the markers `label` (n,) at timestamps (..., n); `tracks` are by marker."""
     found = np.full((*t_s.shape, 2), np.nan)
-    for marker, track in enumerate(tracks):
-        mine = label == marker
-        found[..., mine, :] = track.interpolate(t_s[..., mine], gap_s)
+    for track, mine in zip(tracks, group_rows(label, len(tracks)), strict=True):
+        if len(mine):
+            found[..., mine, :] = track.interpolate(t_s[..., mine], gap_s)
     return found
 
 
@@ -402,15 +411,12 @@ class WandRecording:
 
     def undistort_tracks(self, lenses: Sequence[Lens]) -> "WandRecording":
         """The recording with its tracks undistorted by other lenses; `lenses` stay the given ones."""
-        tracks = [
-            [
-                MarkerTrack.of(
-                    track.t_s, new.normalise(old.project(np.column_stack([track.xy, np.ones(len(track.xy))])))
-                )
-                for track in mine
-            ]
-            for mine, old, new in zip(self.tracks, self.lenses, lenses, strict=True)
-        ]
+        tracks = []
+        for mine, old, new in zip(self.tracks, self.lenses, lenses, strict=True):
+            xy = np.concatenate([track.xy for track in mine])
+            xy = new.normalise(old.project(np.column_stack([xy, np.ones(len(xy))])))
+            parts = np.split(xy, np.cumsum([len(track.xy) for track in mine])[:-1])
+            tracks.append([MarkerTrack.of(track.t_s, part) for track, part in zip(mine, parts, strict=True)])
         return replace(self, tracks=tracks)
 
 

@@ -11,7 +11,7 @@ Why a camera could not be placed (a wrong clock, a mirrored image, or too few co
 each fault: if a camera fits another one after its timestamps are shifted, or its image is mirrored, it has that fault.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -28,6 +28,7 @@ from calib.wand.detections import (
     Timing,
     WandDetections,
     build_tracks,
+    group_rows,
     interpolate,
     ranges,
 )
@@ -37,6 +38,7 @@ from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 
 MIN_FRAME_SETS = 8  # that two cameras must share
+MANY = 32  # markers of a wand, above which not all of its lengths are compared
 SAMPLE = 1500  # detections that the essential matrix is fitted to
 GATE_PX = 5.0
 MAX_SPREAD = 0.15  # of the logarithm of the scale, over the wand's lengths: a larger one rejects the pose
@@ -198,7 +200,7 @@ class TwoViewGeometry:
         gap = np.minimum(np.abs(times[before] - t_s[rows]), np.abs(times[after] - t_s[rows]))
         near = rows[gap <= self.gap_s + SAME_S]
         frames = np.unique(self.detections.frame[near])
-        count = max(round(SAMPLE * len(frames) / max(len(near), 1)), 1)
+        count = max(round(SAMPLE * len(frames) / max(len(near), 1)), MIN_FRAME_SETS)
         chosen = frames[spread_evenly(len(frames), count)]
         return near[np.isin(self.detections.frame[near], chosen)]
 
@@ -235,21 +237,28 @@ class TwoViewGeometry:
         frame, label = self.detections.frame[rows], self.detections.label[rows]
         table = np.full((len(np.unique(frame)), len(self.wand.markers), 3), np.nan)
         table[np.unique(frame, return_inverse=True)[1], label] = points
-        gaps = np.linalg.norm(table[:, :, None] - table[:, None], axis=3)
-        known = np.linalg.norm(self.wand.points[:, None] - self.wand.points[None], axis=2)
-        upper = np.triu(np.ones(known.shape, bool), 1)
-        ratios = (known / np.where(gaps > 0, gaps, np.nan))[:, upper].ravel()
+        ratios = np.concatenate([np.zeros(0), *self._length_ratios(table)])
         if not np.isfinite(ratios).any():
             ratios = self._ranges[rows] / np.linalg.norm(points, axis=1)
         return ratios[np.isfinite(ratios)]
+
+    def _length_ratios(self, table: Array) -> Iterator[Array]:
+        """Yield the ratios of the wand's lengths to those of its markers (F, M, 3), between markers that are 1, 2, 4,
+        ... numbers apart: of a few markers all lengths, of many a number that grows as M log M."""
+        points, most = self.wand.points, len(self.wand.markers)
+        for step in range(1, most) if most <= MANY else 2 ** np.arange(most.bit_length() - 1):
+            gaps = np.linalg.norm(table[:, step:] - table[:, :-step], axis=2)
+            known = np.linalg.norm(points[step:] - points[:-step], axis=1)
+            yield (known / np.where(gaps > 0, gaps, np.nan)).ravel()
 
     def _depths_of_b(self, rows: Index, points: Array, b: int, shift_s: float) -> dict[int, float]:
         """Return distances from camera b to points (n, 3) in its frame, at its detections nearest in time."""
         label, t_s = self.detections.label, self.detections.t_s
         depth: dict[int, float] = {}
-        for marker in range(len(self.wand.markers)):
-            mine = np.flatnonzero(label[rows] == marker)
-            theirs = self.rows[b][label[self.rows[b]] == marker]
+        markers = len(self.wand.markers)
+        groups = zip(group_rows(label[rows], markers), group_rows(label[self.rows[b]], markers), strict=True)
+        for mine, others in groups:
+            theirs = self.rows[b][others]
             if len(mine) and len(theirs):
                 at = np.searchsorted(t_s[theirs], t_s[rows[mine]] + shift_s)
                 depth |= _lengths(theirs[np.minimum(at, len(theirs) - 1)], points[mine])

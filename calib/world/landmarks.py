@@ -172,8 +172,11 @@ def locate_landmarks(
         CalibrationError: no arrangement of the roundels has these distances, or two different ones have.
     """
     roundels = [r for r in roundels if r.camera in cameras]
-    if numbered := [r for r in roundels if str(r.id) in landmarks]:
-        return _triangulate(cameras, {name: [r for r in numbered if str(r.id) == name] for name in landmarks})
+    named: dict[str, list[StillRoundel]] = {name: [] for name in landmarks}
+    for roundel in roundels:
+        named.get(str(roundel.id), []).append(roundel)
+    if any(named.values()):
+        return _triangulate(cameras, named)
     points = _triangulate_pairs(cameras, roundels)
     surveyed = np.array(list(landmarks.values()), float)
     hypotheses = [

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Finds stationary roundels in the images of cameras, and the images of their discs' own centres."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from calib.rig.camera import Camera
 from camera_node.detection.disc_pose import DiscPose, locate
 from camera_node.detection.roundels import Roundel, Roundels
-from camera_node.foundation.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.outline import half_axes_of
 from camera_node.protocol.messages import Detections
 
@@ -37,20 +37,22 @@ class StillRoundel:
 
 
 def find_still_roundels(messages: Sequence[Detections]) -> list[StillRoundel]:
-    """Find the roundels that each camera detects at the same pixel in 30 % of its frames or more."""
+    """Find the roundels that each camera detects at the same pixel, under one number or none, in 30 % of its frames or
+    more."""
     frames: dict[str, list[Roundels]] = {}
     for message in messages:
         frames.setdefault(message.camera, []).append(message.unpack())
     found = []
     for camera, seen in frames.items():
         uv, ids = np.concatenate([r.uv for r in seen]), np.concatenate([r.id for r in seen])
-        shapes, remaining = np.concatenate([_shapes(r) for r in seen]), np.ones(len(uv), bool)
-        while remaining.any():
-            cluster = _first_cluster(uv, remaining)
-            remaining &= ~cluster
-            if cluster.sum() >= max(MIN_PRESENCE * len(seen), 1):
-                mean, number = uv[cluster].mean(axis=0), int(np.median(ids[cluster]))
-                found.append(StillRoundel(camera, mean, number, shapes[cluster].mean(axis=0)))
+        shapes = np.concatenate([_shapes(r) for r in seen])
+        order = np.argsort(ids, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(ids[order])) + 1):
+            for cluster in _clusters(uv[rows]):
+                if len(cluster) >= max(MIN_PRESENCE * len(seen), 1):
+                    chosen = rows[cluster]
+                    mean, shape = uv[chosen].mean(axis=0), shapes[chosen].mean(axis=0)
+                    found.append(StillRoundel(camera, mean, int(ids[chosen[0]]), shape))
     return found
 
 
@@ -58,6 +60,15 @@ def _shapes(roundels: Roundels) -> Array:
     """(N, 2, 2) shapes as in `StillRoundel`."""
     half_axes = half_axes_of(roundels.axes_px, roundels.angle_rad)
     return half_axes @ half_axes.mT
+
+
+def _clusters(uv: Array) -> Iterator[Index]:
+    """Yield the indices of pixels (N, 2) that are near each other."""
+    remaining = np.ones(len(uv), bool)
+    while remaining.any():
+        cluster = _first_cluster(uv, remaining)
+        remaining &= ~cluster
+        yield np.flatnonzero(cluster)
 
 
 def _first_cluster(uv: Array, remaining: Mask) -> Mask:

@@ -24,7 +24,7 @@ from calib.rig.triangulation import intersect
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_markers
-from calib.wand.detections import WandDetections, WandRecording, interpolate, ranges
+from calib.wand.detections import WandDetections, WandRecording, group_rows, interpolate, ranges
 from calib.wand.wand_report import Exchange, Validation
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
@@ -99,8 +99,11 @@ def check_motion(detections: WandDetections, names: Sequence[str], lenses: Seque
     """Raise CalibrationError where no camera saw the wand move: a wand at rest determines little, and no clock."""
     moved, share = {}, {}
     for k, (name, lens) in enumerate(zip(names, lenses, strict=True)):
-        for marker in np.unique(detections.label[detections.camera == k]):
-            uv = detections.uv[(detections.camera == k) & (detections.label == marker)]
+        mine = np.flatnonzero(detections.camera == k)
+        for rows in group_rows(detections.label[mine], int(detections.label.max(initial=-1)) + 1):
+            if not len(rows):
+                continue
+            uv = detections.uv[mine[rows]]
             away = float(np.quantile(np.linalg.norm(uv - np.median(uv, axis=0), axis=1), 0.95))
             moved[name] = max(moved.get(name, 0.0), away)
             share[name] = moved[name] / max(lens.width, lens.height)
@@ -114,7 +117,11 @@ def check_motion(detections: WandDetections, names: Sequence[str], lenses: Seque
 
 def check_spacing(wand: Body, adjusted: Adjusted, observations: WandObservations) -> None:
     """Raise CalibrationError where the cameras measure other distances between the wand's markers than its file has."""
-    pairs = np.array(list(combinations(range(len(wand.markers)), 2)), np.intp)
+    # A marker at a wrong place is at wrong distances from the markers that are farthest apart: their number counts.
+    basis = adjusted.problem.wand.basis.tolist()
+    pairs = np.array(
+        sorted({(min(a, b), max(a, b)) for a in basis for b in range(len(wand.markers)) if a != b})
+    )
     if len(pairs) < 2:
         return
     given = _pair_distances(wand.points[None], pairs)[0]

@@ -145,6 +145,28 @@ def test_one_view_of_a_plane_leaves_two_poses_and_a_second_camera_decides():
     assert transform(found, square) == pytest.approx(transform(T_cam_wand, square), abs=0.02)
 
 
+def test_ten_frames_of_many_numbered_points_place_the_cameras():
+    """A board of 240 points: the sample of detections for two views holds six frames of them, of which eight are
+    needed."""
+    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 24), np.linspace(-0.3, 0.3, 10)), axis=-1).reshape(
+        -1, 2
+    )
+    board = WandBody(markers=tuple((x, y, 0.0) for x, y in grid.tolist()))
+    arena, rng, messages = ring(4), np.random.default_rng(0), []
+    for seq in range(10):
+        t_ns = 700_000_000 * seq
+        points = transform(arena.wand_pose(1e-9 * t_ns), board.points)
+        for name, camera in arena.truth.cameras.items():
+            uv = camera.project_world(points) + SIGMA_PX * rng.standard_normal((240, 2))
+            seen = np.flatnonzero(camera.sees(uv))
+            roundels = Roundels.from_points(uv[seen], SIGMA_PX, seen.astype(np.int32))
+            header = {"camera": name, "width": camera.width, "height": camera.height}
+            messages.append(Detections.pack(roundels, seq=seq, t_ns=t_ns, **header))
+    result = calibrate(arena.intrinsics, board, messages, synchronous=True)
+    assert len(result.rig.placed()) == 4
+    assert camera_errors(result.rig, arena.truth)[0].max() < 0.01
+
+
 DATA = Path(os.environ.get("ROUNDEL_SHARED_DATA", "/work/shared/data")) / "tag_wand"
 
 
