@@ -42,6 +42,7 @@ RENEW = "renew it as docs/security.md describes"
 LISTEN_S = 2.5  # at least two statuses of every camera
 MAX_CAMERAS = 256
 MAX_CLOCK_ERROR_MS = 1.0  # a robot at 1 m/s moves 1 mm in this time
+SKIPPED = "late: a slow network or machine; refused: see docs/troubleshooting.md"
 REMEDIES = {
     "sends no frames": "check its program: journalctl -u roundel-camera@NAME",
     "is not calibrated": "calibrate it: roundel calibrate wand --live --only NAME",
@@ -218,6 +219,9 @@ def check_arena(observation: Observation, now: datetime) -> Iterator[Finding]:
     for name, state in status.robots.items():
         remedy = "" if state == "tracked" else "check that cameras see it, and its markers: roundel define"
         yield Finding("warning" if remedy else "ok", f"robot {name}", state, remedy)
+    for name, cause in status.not_acquired.items():
+        if name not in status.robots:
+            yield Finding("warning", f"robot {name}", "never found", cause)
     for name, residual in status.geometry_residuals_px.items():
         yield Finding(
             "warning",
@@ -240,7 +244,8 @@ def _check_cameras(status: FusionStatus) -> Iterator[Finding]:
     for name, health in sorted(status.cameras.items()):
         problems = camera_problems(health)
         for problem in problems:
-            yield Finding("error", f"camera {name}", problem, REMEDIES[problem].replace("NAME", name))
+            remedy = REMEDIES.get(problem, SKIPPED).replace("NAME", name)
+            yield Finding("error", f"camera {name}", problem, remedy)
         if not problems:
             residual = "" if health.residual_px is None else f", residual {health.residual_px:.2f} px"
             yield Finding("ok", f"camera {name}", f"{health.fps:.0f} frames/s{residual}")

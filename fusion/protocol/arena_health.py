@@ -8,10 +8,13 @@ import msgspec
 
 from calib.rig.rig import Rig
 from camera_node.protocol.presence import MAX_NAMED, NO_CAMERA, listed, no_such
-from fusion.protocol.pose_messages import CameraHealth, FusionStatus
+from fusion.protocol.pose_messages import SKIPPED_S, CameraHealth, FusionStatus
 
 MAX_CALIBRATION_DAYS = 90
 POOR_GRADES = "CD"
+# Of frames, that may be lost: single frames are lost in any wireless network, and a robot coasts longer than their gap.
+SKIPPED_SHARE = 0.05
+NOT_FOUND = "not found"  # the state of a declared robot that was never tracked
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True):
@@ -58,6 +61,8 @@ def assess_health(status: FusionStatus, rig: Rig | None, now: datetime) -> Arena
     placed = rig.placed() if rig else {}
     problems += [f"camera {name}: never sent a frame" for name in placed if name not in status.cameras]
     problems += [f"robot {name} is {state}" for name, state in status.robots.items() if state != "tracked"]
+    never = {name: cause for name, cause in status.not_acquired.items() if name not in status.robots}
+    problems += [f"robot {name} was never found: {cause}" for name, cause in never.items()]
     problems += [
         f"robot {name}: its markers are not where robots.yaml has them ({residual:.1f} px)"
         for name, residual in status.geometry_residuals_px.items()
@@ -69,7 +74,7 @@ def assess_health(status: FusionStatus, rig: Rig | None, now: datetime) -> Arena
     problems += calibration_problems(calibration)
     return ArenaHealth(
         cameras={name: False for name in placed} | {name: c.fps > 0 for name, c in status.cameras.items()},
-        robots=dict(status.robots),
+        robots={**status.robots, **dict.fromkeys(never, NOT_FOUND)},
         poses_per_s=status.frame_sets_per_s,
         faults=sum(status.faults.values()),
         calibration=calibration,
@@ -86,7 +91,16 @@ def camera_problems(health: CameraHealth) -> list[str]:
         "repeats an old image": health.frozen,
         "two nodes use its name": health.duplicate_publisher,
     }
-    return [problem for problem, holds in states.items() if holds]
+    return [problem for problem, holds in states.items() if holds] + _skipped_frames(health)
+
+
+def _skipped_frames(health: CameraHealth) -> list[str]:
+    """The frames of a calibrated camera that were not used, where they are many."""
+    tolerated = SKIPPED_SHARE * SKIPPED_S * health.fps
+    if not health.calibrated or sum(health.skipped.values()) <= tolerated:
+        return []
+    reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(health.skipped.items()))
+    return [f"frames of the last {SKIPPED_S} s are not used: {reasons}"]
 
 
 def assess_calibration(rig: Rig | None, now: datetime) -> Calibration:
@@ -167,8 +181,9 @@ def describe_status(status: FusionStatus) -> str:
     """The server's cameras, robots and rate in one line, for `systemctl status`."""
     live = sum(camera.fps > 0 for camera in status.cameras.values())
     tracked = sum(state == "tracked" for state in status.robots.values())
+    declared = len({*status.robots, *status.not_acquired})
     return (
-        f"{live} of {len(status.cameras)} cameras, {tracked} of {len(status.robots)} robots tracked, "
+        f"{live} of {len(status.cameras)} cameras, {tracked} of {declared} robots tracked, "
         f"{status.frame_sets_per_s:.0f} poses/s, {sum(status.faults.values())} faults"
     )
 

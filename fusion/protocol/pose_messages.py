@@ -256,6 +256,9 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
         return list(zip(self.cameras, *(column.tolist() for column in columns), sigmas, strict=True))
 
 
+SKIPPED_S = 10  # seconds, of `CameraHealth.skipped`
+
+
 class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     """The server's figures of one camera over the last second."""
 
@@ -270,6 +273,9 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     frozen: bool = False  # the camera repeats an old image: excluded until it delivers new ones
     duplicate_publisher: bool = False  # two nodes publish under its name
     faults: dict[str, int] = {}  # what was skipped of it since the server started, by reason
+    skipped: dict[
+        str, int
+    ] = {}  # frames of the last `SKIPPED_S` that were not used: refused or late, by reason
     clock: str = "correct"  # or "excluded" while its stamps are wrong by an unknown time, or "corrected"
     clock_correction_ms: float = 0.0  # added to its stamps
     clock_sigma_ms: float = 0.0  # standard deviation of the correction

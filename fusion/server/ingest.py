@@ -133,7 +133,7 @@ class Ingest:
         return message
 
     def _refuse(self, reason: str, camera: str | None = None) -> None:
-        self._statistics.count_fault(reason, camera)
+        self._statistics.count_refusal(reason, camera)
 
     def _has_room(self, name: str, is_calibrated: bool) -> bool:
         """Whether the camera is in the rig, or there is room for another one that is not."""

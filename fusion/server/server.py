@@ -244,7 +244,7 @@ class Server:
         if frame is None:
             self.pipeline.synchronizer.ignore(name)
             if name not in self.pipeline.withheld_cameras():
-                self.statistics.count_fault("implausible time", name)
+                self.statistics.count_refusal("implausible time", name)
             return
         age_ns = received_ns - frame.t_ns  # of all cameras on a slow link, which none outruns
         is_on_time = age_ns <= self._max_lag_ns and self.pipeline.synchronizer.add(frame)

@@ -6,7 +6,7 @@ import os
 import resource
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,13 +15,14 @@ import numpy as np
 from camera_node.foundation.logs import about
 from fusion.model.limits import Limits
 from fusion.monitoring.clocks.camera_clocks import ClockHealth
-from fusion.protocol.pose_messages import CameraHealth, FusionStatus, TrackingState
+from fusion.protocol.pose_messages import SKIPPED_S, CameraHealth, FusionStatus, TrackingState
 from fusion.tracking.result import CameraUse
 
 log = logging.getLogger("fusion")
 ON_TIME_S = 30.0  # without a late frame, after which a camera is on time again: at most two lines a minute
 SILENT_S = 2.0  # without a frame: a camera is gone
 PERIOD_NS = 1_000_000_000
+LATE = "frames that arrived too late"
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,14 @@ class _CameraCounts:
     faults: Counter[str] = field(default_factory=Counter)
     reported: Counter[str] = field(default_factory=Counter)  # the faults at the last status
     growing: frozenset[str] = frozenset()  # faults that occurred in the second before it
+    skipped: Counter[str] = field(default_factory=Counter)  # frames since the last status
+    skipped_before: deque[Counter[str]] = field(default_factory=lambda: deque(maxlen=SKIPPED_S))
 
 
 class ServerStatistics:
-    """Counts what the server receives and computes. `count_fault` is callable from any thread, the rest from one.
+    """Counts what the server receives and computes.
+
+    `count_fault` and `count_refusal` are callable from any thread, the rest from one.
 
     Args:
         lateness_limit_ms: how long a frame set waits for frames, for the log.
@@ -105,6 +110,13 @@ class ServerStatistics:
             self._faults[reason] += 1
             if camera is not None and camera in self._cameras:
                 self._cameras[camera].faults[reason] += 1
+
+    def count_refusal(self, reason: str, camera: str | None) -> None:
+        """Count a frame that is not used: a fault, and among what the camera's health has of the last seconds."""
+        self.count_fault(reason, camera)
+        with self._lock:
+            if camera is not None and camera in self._cameras:
+                self._cameras[camera].skipped[reason] += 1
 
     def count_arrival(self, name: str, t_ns: int, received_ns: int) -> None:
         """Count a camera's frame; log a camera that is new or back."""
@@ -152,6 +164,8 @@ class ServerStatistics:
                 log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
                 camera.late_since_ns, camera.late_before = now_ns, camera.late
             camera.late, camera.late_ns = camera.late + 1, now_ns
+            with self._lock:
+                camera.skipped[LATE] += 1
         elif camera.late_since_ns and age_ms < limit_ms and now_ns - camera.late_ns > ON_TIME_S * 1e9:
             seconds, count = (camera.late_ns - camera.late_since_ns) * 1e-9, camera.late - camera.late_before
             text = "%s is on time again: %d of its frames in %.0f s were too late and were dropped"
@@ -182,6 +196,7 @@ class ServerStatistics:
         self._calibrated = pipeline.calibrated
         self._find_silent_cameras(now_ns)
         self._find_faulty_cameras()
+        self._remember_skipped()
         cpu_s = time.process_time()
         with self._lock:
             faults = dict(self._faults)
@@ -225,6 +240,12 @@ class ServerStatistics:
                 log.warning("camera %s is gone: no frame for %.0f s", name, SILENT_S, extra=self._about(name))
             camera.is_gone = True
 
+    def _remember_skipped(self) -> None:
+        for camera in self._cameras.values():
+            with self._lock:
+                camera.skipped_before.append(camera.skipped)
+                camera.skipped = Counter()
+
     def _find_faulty_cameras(self) -> None:
         """Log the faults of a camera once when they begin."""
         for name, camera in self._cameras.items():
@@ -261,6 +282,7 @@ def _camera_health(
         frozen=name in pipeline.frozen,
         duplicate_publisher=camera.has_two_publishers,
         faults=dict(camera.faults),
+        skipped=dict(sum(camera.skipped_before, Counter())),
         clock=clock.state,
         clock_correction_ms=clock.offset_ms,
         clock_sigma_ms=clock.sigma_ms,

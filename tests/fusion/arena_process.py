@@ -5,7 +5,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
 
@@ -49,15 +49,17 @@ def in_real_time(
 
 
 @contextlib.contextmanager
-def cameras_at(endpoint: str) -> Iterator[None]:
-    """Publish what the cameras see, in real time."""
+def cameras_at(
+    endpoint: str, altered: Callable[[Detections], Detections] = lambda message: message
+) -> Iterator[None]:
+    """Publish what the cameras see, in real time, each message as `altered` makes it."""
     messages = sorted(ARENA.messages(round(LOOP_S * 1e9 / PERIOD_NS)), key=lambda message: message.t_ns)
     stop = threading.Event()
 
     def publish() -> None:
         with open_client([endpoint]) as session:
             for message in in_real_time(messages, LOOP_S, stop):
-                session.put(KEYS.detections(message.camera), encode(message))
+                session.put(KEYS.detections(message.camera), encode(altered(message)))
 
     thread = threading.Thread(target=publish)
     thread.start()
