@@ -29,6 +29,7 @@ from fusion.protocol.arena_health import (
     calibration_problems,
     camera_problems,
     describe_calibration,
+    describe_contradiction,
 )
 from fusion.protocol.pose_messages import FusionStatus
 from fusion.server.arena_config import ArenaConfig
@@ -229,6 +230,9 @@ def check_arena(observation: Observation, now: datetime) -> Iterator[Finding]:
             f"its markers are {residual:.1f} px from their places",
             "measure it again",
         )
+    for contradiction in status.contradictions:
+        state, remedy = describe_contradiction(contradiction).rsplit("; ", 1)
+        yield Finding("warning", "claims", state, remedy)
     for name, diameter_m in status.measured_diameters_m.items():
         yield Finding(
             "warning",

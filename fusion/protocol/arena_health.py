@@ -8,7 +8,7 @@ import msgspec
 
 from calib.rig.rig import Rig
 from camera_node.protocol.presence import MAX_NAMED, NO_CAMERA, listed, no_such
-from fusion.protocol.pose_messages import SKIPPED_S, CameraHealth, FusionStatus
+from fusion.protocol.pose_messages import SKIPPED_S, CameraHealth, Contradiction, FusionStatus
 
 MAX_CALIBRATION_DAYS = 90
 POOR_GRADES = "CD"
@@ -71,6 +71,7 @@ def assess_health(status: FusionStatus, rig: Rig | None, now: datetime) -> Arena
         f"robot {name}: its discs measure {1e3 * diameter_m:.0f} mm, not as declared"
         for name, diameter_m in status.measured_diameters_m.items()
     ]
+    problems += [describe_contradiction(contradiction) for contradiction in status.contradictions]
     problems += calibration_problems(calibration)
     return ArenaHealth(
         cameras={name: False for name in placed} | {name: c.fps > 0 for name, c in status.cameras.items()},
@@ -101,6 +102,21 @@ def _skipped_frames(health: CameraHealth) -> list[str]:
         return []
     reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(health.skipped.items()))
     return [f"frames of the last {SKIPPED_S} s are not used: {reasons}"]
+
+
+def describe_contradiction(contradiction: Contradiction) -> str:
+    """Who contradicts the claims, by how much, and the likely causes."""
+    times = f"{contradiction.error_over_claim:.1f} times their claim"
+    size = f"by {contradiction.size_mm:.1f} mm (squared residuals {times})"
+    names = listed(contradiction.names)
+    if contradiction.kind == "camera":
+        cause = "it was moved, or its lens or clock changed"
+        return f"camera {names} contradicts the other cameras {size}: {cause}; calibrate it again"
+    if contradiction.kind == "robot":
+        cause = "a marker was displaced, or robots.yaml does not have their places"
+        return f"robot {names}: its markers contradict each other {size}: {cause}; measure it again"
+    cause = "which one is wrong is undecided, or the lenses or the wand's lengths are"
+    return f"cameras {names} contradict each other {size}: {cause}; calibrate again"
 
 
 def assess_calibration(rig: Rig | None, now: datetime) -> Calibration:

@@ -281,6 +281,23 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     clock_sigma_ms: float = 0.0  # standard deviation of the correction
 
 
+class Contradiction(msgspec.Struct, frozen=True, kw_only=True):
+    """Residuals of the last seconds that are larger than claimed.
+
+    Attributes:
+        kind: "camera": all fits without it; "robot": the others of its cameras fit; "undecided": no single camera
+            explains it, or several do.
+        names: the camera, the robot, or the cameras that contradict each other.
+        error_over_claim: squared residuals over their expectation, of the robot that contradicts most.
+        size_mm: of the errors at the robots, RMS.
+    """
+
+    kind: Literal["camera", "robot", "undecided"]
+    names: tuple[str, ...]
+    error_over_claim: float
+    size_mm: float
+
+
 class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     """The server's status, once a second. `faults` counts what was skipped since the start, by its reason."""
 
@@ -297,6 +314,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     geometry_residuals_px: dict[str, float] = {}  # RMS of robots whose markers are not at the declared places
     measured_diameters_m: dict[str, float] = {}  # of the discs of robots that declare another diameter
     not_acquired: dict[str, str] = {}  # why, by robot
+    contradictions: tuple[Contradiction, ...] = ()  # of residuals to their claims
     unsaved_robots: tuple[str, ...] = ()  # names whose changes a restart would undo
     rig_t_ns: int | None = None  # `RigMessage.t_ns` of the rig in force; None without one
 

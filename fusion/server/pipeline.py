@@ -243,4 +243,5 @@ class TrackingPipeline:
             geometry_residuals_px=tracker.geometry.misfits(),
             measured_diameters_m=tracker.sizes.misfits(),
             not_acquired=tracker.not_acquired(),
+            contradictions=tracker.claims.contradictions(),
         )

@@ -15,7 +15,13 @@ import numpy as np
 from camera_node.foundation.logs import about
 from fusion.model.limits import Limits
 from fusion.monitoring.clocks.camera_clocks import ClockHealth
-from fusion.protocol.pose_messages import SKIPPED_S, CameraHealth, FusionStatus, TrackingState
+from fusion.protocol.pose_messages import (
+    SKIPPED_S,
+    CameraHealth,
+    Contradiction,
+    FusionStatus,
+    TrackingState,
+)
 from fusion.tracking.result import CameraUse
 
 log = logging.getLogger("fusion")
@@ -38,6 +44,7 @@ class PipelineStatus:
         geometry_residuals_px: RMS of robots whose markers are not at the declared places.
         measured_diameters_m: of the discs of robots that declare another diameter.
         not_acquired: why robots were not acquired, by name.
+        contradictions: of residuals to their claims.
         unsaved_robots: names of the robots whose changes a restart would undo.
         rig_t_ns: since when the active rig is in force.
     """
@@ -50,6 +57,7 @@ class PipelineStatus:
     geometry_residuals_px: dict[str, float] = field(default_factory=dict)
     measured_diameters_m: dict[str, float] = field(default_factory=dict)
     not_acquired: dict[str, str] = field(default_factory=dict)
+    contradictions: tuple[Contradiction, ...] = ()
     unsaved_robots: tuple[str, ...] = ()
     rig_t_ns: int | None = None
 
@@ -217,6 +225,7 @@ class ServerStatistics:
             geometry_residuals_px=pipeline.geometry_residuals_px,
             measured_diameters_m=pipeline.measured_diameters_m,
             not_acquired=pipeline.not_acquired,
+            contradictions=pipeline.contradictions,
             unsaved_robots=pipeline.unsaved_robots,
             rig_t_ns=pipeline.rig_t_ns,
         )

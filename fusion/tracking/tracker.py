@@ -21,6 +21,7 @@ from fusion.protocol.pose_messages import RobotPose
 from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import AssociatedFrames, Association, OwnDetections
+from fusion.tracking.claim_check import ClaimCheck
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.rays import Marker
 from fusion.tracking.result import (
@@ -99,6 +100,7 @@ class Tracker:
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
         self.monitors = CameraMonitors(self.cameras, self.table.markers, self.table.single)
+        self.claims = ClaimCheck(self.estimator, self.table.markers, self.table.names)
         self.geometry = GeometryCheck(self.table.names, self.table.single)
         diameters = np.array([robot.diameter_m for robot in robots.values()])
         self.sizes = SizeCheck(self.table.names, diameters, self.cameras, self.table.markers)
@@ -175,6 +177,7 @@ class Tracker:
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
         self.sizes.observe(self.table.states, update.detections, update.assignments)
+        self.claims.observe(update.prediction, self.table.states, update.detections, update.assignments)
         update, found = self._acquire(update)
         table = self.table
         now = Snapshot(update.t_ns, table.states, table.tracked)

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Compares residuals with their claims, and names the camera or the robot that contradicts the others.
+
+The squared residuals of a robot's detections in a frame set, in claimed standard deviations, have an expected sum:
+their number less what the estimate absorbs (redundancy, Baarda 1968). Sums over some seconds are compared. A camera is
+named if all residuals fit once it is left out, and not once any other is; a robot if the others of its cameras fit.
+
+The errors of the rig are the same in all frame sets, so they do not average: for cameras with a covariance they enlarge
+the expectation, and have the degrees of freedom of one pose (Satterthwaite 1946).
+"""
+
+from dataclasses import dataclass
+from itertools import compress
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from calib.rig.triangulation import camera_jacobians
+from camera_node.foundation.arrays import Array, Index, Mask
+from fusion import _core
+from fusion.model.observations import (
+    Assignments,
+    DetectionTable,
+    MarkerTable,
+    MatchedObservations,
+)
+from fusion.model.states import States
+from fusion.protocol.pose_messages import Contradiction
+from fusion.tracking.estimator import Estimator, Prediction
+
+SAMPLE_EVERY, SAMPLE = 8, 4  # frame sets, and robots of one: a few milliseconds for any number of robots
+MEMORY = 40  # samples of a robot: 5 s at 60 Hz
+CLAIM_RATIO = 1.5  # of squared errors to claims: less does not change what a claim means
+FALSE_ALARM = 1e-6  # of one comparison: one in a month of ten comparisons a second
+POSE_DEGREES = 6
+MIN_REDUNDANCY = 1.0  # of a frame set: with less, everything fits
+
+
+@dataclass(slots=True)
+class _Sums:
+    """Decaying sums of the samples, of any shape.
+
+    Attributes:
+        squares: of residuals in claimed standard deviations.
+        redundancy: what noise makes of them.
+        rig: what the rig's covariance makes of them.
+        squares_m2: of the errors of detections at the distance of their markers, square metres.
+        count: of detections.
+    """
+
+    squares: Array
+    redundancy: Array
+    rig: Array
+    squares_m2: Array
+    count: Array
+
+    @classmethod
+    def zeros(cls, *shape: int) -> "_Sums":
+        return cls(*np.zeros((5, *shape)))
+
+    def add(self, row: int | tuple[int, int], sample: tuple[float, ...]) -> None:
+        """Add a sample; those before it lose weight."""
+        columns = self.squares, self.redundancy, self.rig, self.squares_m2, self.count
+        for column, value in zip(columns, sample, strict=True):
+            column[row] += value - column[row] / MEMORY
+
+    def ratio(self) -> Array:
+        """Squared errors over their claims; 0 where nothing could contradict."""
+        expected = self.redundancy + self.rig
+        return np.divide(self.squares, expected, out=np.zeros_like(expected), where=self.redundancy > 0)
+
+    def contradicts(self) -> Mask:
+        """Where the squared errors exceed their claims significantly."""
+        expected = np.maximum(self.redundancy + self.rig, 1e-9)
+        degrees = expected**2 / np.maximum(self.redundancy + self.rig**2 / POSE_DEGREES, 1e-9)
+        bound = stats.chi2.isf(FALSE_ALARM, np.maximum(degrees, 1e-3)) / np.maximum(degrees, 1e-3)
+        return (self.redundancy > MIN_REDUNDANCY) & (self.ratio() > np.maximum(CLAIM_RATIO, bound))
+
+
+class ClaimCheck:
+    """The residuals of the last seconds, by robot, and as they are without each camera.
+
+    Args:
+        estimator: of the robots.
+        markers: of all robots.
+        names: of the robots.
+    """
+
+    def __init__(self, estimator: Estimator, markers: MarkerTable, names: tuple[str, ...]) -> None:
+        self._estimator, self._markers, self._names = estimator, markers, names
+        n, c = len(names), len(estimator.cameras.names)
+        self._all, self._without = _Sums.zeros(n), _Sums.zeros(n, c)
+        self._left_out_m2, self._left_out = np.zeros(
+            (2, n, c)
+        )  # errors of a camera by the others: sums, counts
+        self._samples = np.zeros(n, int)
+        self._turn = self._next = 0
+
+    def observe(
+        self, prediction: Prediction, states: States, detections: DetectionTable, assignments: Assignments
+    ) -> None:
+        """Take some robots of every eighth frame set.
+
+        Args:
+            prediction, states: of the robots before and after the update.
+            detections, assignments: of the frame set.
+        """
+        self._turn += 1
+        if self._turn % SAMPLE_EVERY or not len(assignments):
+            return
+        owner = self._markers.robot[assignments.marker]
+        robots = np.unique(owner)
+        chosen = np.roll(robots, -int(np.searchsorted(robots, self._next)))[:SAMPLE]
+        self._next = int(chosen[-1]) + 1
+        rows = np.flatnonzero(np.isin(owner, chosen))
+        observations = MatchedObservations.of(assignments.select(rows), detections, self._markers)
+        observations = self._estimator.with_time_errors(states, observations)
+        A, nu = self._estimator.innovations(states, observations)
+        A, nu = A.reshape(-1, 2, 12), nu.reshape(-1, 2)
+        metres, rig = self._sizes(states, observations)
+        moved = states.minus(prediction.states)
+        for robot in chosen.tolist():
+            mine = np.flatnonzero((owner[rows] == robot) & np.isfinite(nu).all(axis=1))
+            camera = detections.camera[assignments.detection[rows[mine]]]
+            information = prediction.information[robot]
+            self._sample(
+                robot,
+                camera,
+                _Equations(A[mine], nu[mine], metres[mine], rig[mine]),
+                information,
+                moved[robot],
+            )
+
+    def _sample(
+        self, robot: int, camera: Index, equations: "_Equations", information: Array, moved: Array
+    ) -> None:
+        whole, _ = equations.solve(np.ones(len(camera), bool), information, moved)
+        self._all.add(robot, whole)
+        self._samples[robot] += 1
+        for k in range(self._without.squares.shape[1]):
+            out = camera == k
+            if not out.any():
+                self._without.add((robot, k), whole)
+                continue
+            without, left_out_m2 = equations.solve(~out, information, moved)
+            self._without.add((robot, k), without)
+            self._left_out_m2[robot, k] += left_out_m2 - self._left_out_m2[robot, k] / MEMORY
+            self._left_out[robot, k] += out.sum() - self._left_out[robot, k] / MEMORY
+
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """What contradicts the claims: one camera, robots, or cameras of which nothing decides which one is wrong."""
+        known = self._samples >= MEMORY // 2
+        bad = self._all.contradicts() & known
+        if not bad.any():
+            return ()
+        fine = known & ~bad
+        involved = self._left_out[bad].sum(axis=0) > 0
+        still = self._without.contradicts() | (self._without.redundancy <= MIN_REDUNDANCY)
+        explains = involved & ~still[bad].any(axis=0) & ~(self._left_out[fine].sum(axis=0) > 0)
+        if explains.sum() == 1:
+            errors_m2, count = (
+                self._left_out_m2[bad][:, explains].sum(),
+                self._left_out[bad][:, explains].sum(),
+            )
+            return (self._describe("camera", bad, explains, errors_m2 / count),)
+        if not explains.any() and (fine.any() or bad.sum() == 1):
+            rows = np.eye(len(bad), dtype=bool)[bad]
+            return tuple(self._describe("robot", row, involved, self._mean_m2(row)) for row in rows)
+        return (
+            self._describe("undecided", bad, explains if explains.any() else involved, self._mean_m2(bad)),
+        )
+
+    def _mean_m2(self, robots: Mask) -> float:
+        """The mean squared error of the detections of these robots, square metres."""
+        return float(self._all.squares_m2[robots].sum() / self._all.count[robots].sum())
+
+    def _describe(
+        self, kind: Literal["camera", "robot", "undecided"], robots: Mask, cameras: Mask, error_m2: float
+    ) -> Contradiction:
+        of_robots = kind == "robot"
+        names, chosen = (self._names, robots) if of_robots else (self._estimator.cameras.names, cameras)
+        return Contradiction(
+            kind=kind,
+            names=tuple(compress(names, chosen.tolist())),
+            error_over_claim=float(self._all.ratio()[robots].max()),
+            size_mm=1e3 * float(np.sqrt(error_m2)),
+        )
+
+    def _sizes(self, states: States, observations: MatchedObservations) -> tuple[Array, Array]:
+        """One claimed standard deviation of N detections at the distance of their markers, metres (N,), and what the
+        rig's covariance adds to the squares of their residuals (N,)."""
+        cameras, seen = self._estimator.cameras, observations.detections
+        centre = cameras.views(states, seen.exposures, observations.discs).centre
+        weight = np.abs(_determinant(observations.whiten))  # of squares in the image plane
+        rig = np.zeros(len(seen))
+        for k, name in enumerate(cameras.names):
+            camera, mine = cameras[name], np.flatnonzero(seen.camera == k)
+            if camera.covariance is not None and len(mine):
+                J = camera_jacobians(camera, centre[:, mine].T)
+                of_pixel = weight[mine] / np.abs(_determinant(seen.scale[:, :, mine]))
+                rig[mine] = np.einsum("nij,jk,nik->n", J, np.array(camera.covariance), J) * of_pixel
+        return centre[2] / np.sqrt(weight), np.nan_to_num(rig)
+
+
+def _determinant(matrices: Array) -> Array:
+    """(N,) of matrices (2, 2, N)."""
+    (a, b), (c, d) = matrices
+    return np.asarray(a * d - b * c)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """N detections of one robot, linearized: derivatives (N, 2, 12), innovations (N, 2), metres (N,) and rig (N,)."""
+
+    A: Array
+    nu: Array
+    metres: Array
+    rig: Array
+
+    def solve(self, used: Mask, information: Array, moved: Array) -> tuple[tuple[float, ...], float]:
+        """A sample of `_Sums` from the used detections, and the squared errors (m^2) of the others by these.
+
+        Args:
+            used: (N,) the detections.
+            information: (12, 12) of the prediction.
+            moved: (12,) from the prediction to the linearization.
+        """
+        J = self.A[used].reshape(-1, 12)
+        P = _core.inverses((information + J.T @ J)[None])[0]
+        x = P @ (J.T @ self.nu[used].ravel() - information @ moved)
+        residual = self.nu - self.A @ x
+        redundancy = len(J) - float(np.einsum("ni,ij,nj->", J, P, J))
+        squares = (residual**2).sum(axis=1)
+        squares_m2 = squares * self.metres**2
+        sample = (
+            float(squares[used].sum()),
+            redundancy,
+            float(self.rig[used].sum()),
+            float(squares_m2[used].sum()),
+        )
+        return (*sample, float(used.sum())), float(squares_m2[~used].sum())

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Residuals that contradict their claims name the camera or the robot at fault, or say that nothing decides."""
+
+from collections.abc import Mapping
+
+import msgspec
+import numpy as np
+import pytest
+
+from calib.rig.camera import Camera
+from camera_node.geometry.pose import Pose, rotation_from_vector
+from fusion.model.frames import CalibratedFrame
+from fusion.model.robots import Robot
+from fusion.protocol.arena_health import describe_contradiction
+from fusion.protocol.pose_messages import Contradiction
+from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.tracking.tracker import Tracker
+from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, circle, ring
+
+ROBOTS = {"a": TRIANGLE, "b": WIDE}
+DEGREES = 0.1  # that a camera turns: its detections stay within their gates
+FRAME_SETS = 180  # of which 22 are compared
+
+
+def frames(n_cameras: int) -> list[CalibratedFrame]:
+    """Of two robots that drive around, by cameras with their true poses."""
+    phases = (0.0, 0.27, -0.41, 0.38, 0.1, -0.2)
+    motions = {"a": circle(8, 0.8), "b": circle(-8, 1.3, 0.4)}
+    return Arena(ROBOTS, motions, ring(n_cameras), phases, sigma_px=0.1).frames(FRAME_SETS)
+
+
+@pytest.fixture(scope="module")
+def of_four() -> list[CalibratedFrame]:
+    return frames(4)
+
+
+@pytest.fixture(scope="module")
+def of_six() -> list[CalibratedFrame]:
+    return frames(6)
+
+
+def contradictions(
+    seen: list[CalibratedFrame], cameras: dict[str, Camera], robots: Mapping[str, Robot] = ROBOTS
+) -> tuple[Contradiction, ...]:
+    """What a tracker with this rig and these robots finds."""
+    tracker, synchronizer = Tracker(cameras, dict(robots)), FrameSynchronizer(PERIOD_NS)
+    for frame in seen:
+        synchronizer.add(frame)
+        for frame_set in synchronizer.take(frame.t_ns):
+            tracker.track(frame_set)
+    return tracker.claims.contradictions()
+
+
+def with_turned(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
+    T = cameras[name].matrix().copy()
+    T[:3, :3] = T[:3, :3] @ rotation_from_vector(np.radians([0.0, DEGREES, 0.0]))
+    return cameras | {name: msgspec.structs.replace(cameras[name], T_world_cam=Pose.from_matrix(T))}
+
+
+def test_nothing_contradicts_honest_claims(of_four: list[CalibratedFrame], of_six: list[CalibratedFrame]):
+    assert contradictions(of_four, ring(4)) == ()
+    assert contradictions(of_six, ring(6)) == ()
+
+
+def test_a_turned_camera_among_six_is_named_with_its_error(of_six: list[CalibratedFrame]):
+    """At 3 to 5 m, a tenth of a degree are 5 to 9 mm."""
+    (found,) = contradictions(of_six, with_turned(ring(6), "cam1"))
+    assert (found.kind, found.names) == ("camera", ("cam1",))
+    assert 4 < found.size_mm < 10
+    assert found.error_over_claim > 2
+    assert describe_contradiction(found).startswith("camera cam1 contradicts the other cameras by ")
+
+
+def test_of_four_cameras_the_turned_one_is_among_those_that_contradict_each_other(
+    of_four: list[CalibratedFrame],
+):
+    """Its error and that of the camera opposite to it move the robots alike: no other one is blamed."""
+    (found,) = contradictions(of_four, with_turned(ring(4), "cam1"))
+    assert found.kind in ("camera", "undecided")
+    assert "cam1" in found.names
+    assert {"cam0", "cam2"}.isdisjoint(found.names)
+
+
+def test_a_displaced_marker_is_its_robot_s(of_four: list[CalibratedFrame]):
+    """Of 10 mm; the other robot fits, so no camera is at fault."""
+    (x, y, z), *others = TRIANGLE.markers
+    bent = msgspec.structs.replace(TRIANGLE, markers=((x + 0.01, y, z), *others))
+    (found,) = contradictions(of_four, ring(4), {"a": bent, "b": WIDE})
+    assert (found.kind, found.names) == ("robot", ("a",))
+    assert 2 < found.size_mm < 10
+    assert "robots.yaml" in describe_contradiction(found)
+
+
+def test_an_error_that_the_rig_s_covariance_states_is_no_contradiction(of_six: list[CalibratedFrame]):
+    """The same turned camera, in a rig that claims no better."""
+    sigma = np.array([np.radians(DEGREES)] * 3 + [1e-3] * 3)
+    covariance = tuple(map(tuple, np.diag(sigma**2).tolist()))
+    cameras = with_turned(ring(6), "cam1")
+    stated = {name: msgspec.structs.replace(c, covariance=covariance) for name, c in cameras.items()}
+    assert contradictions(of_six, stated) == ()
+
+
+def test_lenses_that_are_all_wrong_blame_no_single_camera(of_four: list[CalibratedFrame]):
+    cameras = {
+        name: msgspec.structs.replace(c, fx=1.01 * c.fx, fy=1.01 * c.fy) for name, c in ring(4).items()
+    }
+    again = [
+        CalibratedFrame.measure(frame.camera, frame.t_ns, frame.roundels, cameras[frame.camera])
+        for frame in of_four
+    ]
+    (found,) = contradictions(again, cameras)
+    assert found.kind == "undecided"
+    assert len(found.names) == 4
