@@ -102,7 +102,8 @@ def test_the_history_is_listed_undone_and_redone(tmp_path: Path):
             for metres in (0.012, 0.034):
                 apply_rig(subscription, files, moved(rig, "north", metres))
             for change in ("north 12.0 mm", "north 22.0 mm"):
-                page.get_by_text(change).wait_for()
+                page.get_by_text(change, exact=True).wait_for()
+            assert page.get_by_role("button", name="Undo the last change: north 22.0 mm").is_enabled()
             assert page.get_by_role("button", name="Redo").is_disabled()
             page.get_by_role("button", name="Undo the last change").click()
             page.get_by_role("cell", name="undone", exact=True).wait_for()
