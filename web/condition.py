@@ -7,13 +7,14 @@ from typing import Literal
 
 import numpy as np
 
+from calib.rig.rig import Rig
 from camera_node.protocol.presence import NO_SERVER, no_such_arena
 from fusion.protocol.pose_messages import FusionStatus
 from web.state.feed import ArenaState
 from web.tables import STALE_S, camera_silence_s, describe_silence, tabulate_cameras, tabulate_robots
 
 Level = Literal["ok", "warn", "bad", "wait"]
-Step = Literal["cameras", "calibrate", "robots", "run"]
+Step = Literal["cameras", "calibrate", "floor", "robots", "run"]
 CONNECT_S = 5.0  # after the start of the page, while the absence of a server is no fault
 
 
@@ -66,7 +67,14 @@ def next_step(state: ArenaState) -> Step:
         return "cameras"
     if state.rig is None or not state.rig.placed():
         return "calibrate"
-    return "run" if state.status is None or state.declared_robots() else "robots"
+    if state.status is None or state.declared_robots():
+        return "run"
+    return "floor" if lacks_floor(state.rig) else "robots"
+
+
+def lacks_floor(rig: Rig) -> bool:
+    """Whether a wand placed the cameras, which defines neither floor nor origin, and nothing else has defined them."""
+    return "grade" in rig.calibration and "world" not in rig.calibration
 
 
 def _server_faults(state: ArenaState, endpoint: str) -> Iterator[Condition]:
@@ -113,7 +121,13 @@ def _robot_faults(state: ArenaState) -> Iterator[Condition]:
     if state.rig is None or state.age_s(state.status) > STALE_S:
         return
     rows = tabulate_robots(state).rows
-    if not rows:
+    if not rows and lacks_floor(state.rig):
+        yield Condition(
+            "warn",
+            "floor and origin are not defined: stand the wand on the floor, or lay the L-frame on it, and open Floor "
+            "and origin in Calibrate",
+        )
+    elif not rows:
         yield Condition("warn", "no robot is declared: open Robots and create one")
     for row in rows:
         if row.cells[1] != "tracked":

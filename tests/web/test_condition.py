@@ -5,6 +5,7 @@ import re
 import time
 from dataclasses import replace
 
+import msgspec
 import pytest
 
 from camera_node.protocol.server_connection import ServerConnection
@@ -129,7 +130,7 @@ def test_cameras_that_locate_by_themselves_need_no_server():
 
 
 def test_the_steps_are_in_the_order_of_the_work(arena: LiveArena, feed: Feed):
-    """Cameras first, then their calibration, then robots."""
+    """Cameras first, then their calibration, then floor and origin, then robots."""
     assert next_step(feed.state()) == "cameras"
     arena.camera("north")
     wait_for(lambda: feed.state().cameras)
@@ -147,8 +148,18 @@ def test_the_steps_are_in_the_order_of_the_work(arena: LiveArena, feed: Feed):
         robots={},
         faults={},
     )
-    state.status = TimedMessage(none, state.now_s)
-    assert next_step(state) == "robots"
+    state.status, state.server_alive = TimedMessage(none, state.now_s), True
+    assert state.rig is not None
+    by_wand = msgspec.structs.replace(state.rig, calibration={"grade": "B"})
+    floor = replace(state, rig=by_wand)
+    assert next_step(floor) == "floor"
+    assert assess(floor, ENDPOINT).text.startswith("floor and origin are not defined: stand the wand")
+    with_world = replace(
+        state, rig=msgspec.structs.replace(by_wand, calibration={"grade": "B", "world": {"date": "today"}})
+    )
+    for ready in (state, with_world):  # the first one was not placed by a wand: its world is its own
+        assert next_step(ready) == "robots"
+        assert assess(ready, ENDPOINT).text.startswith("no robot is declared")
 
 
 def test_a_robot_s_colour_derives_from_its_name():

@@ -13,6 +13,7 @@ from calib.world.landmarks import FRAME, WAND, WorldChange, align_to_roundels, n
 from calib.world.world_frame import is_collinear
 from camera_node.foundation.config import example_file, load_yaml
 from camera_node.geometry.body import Body
+from web.condition import next_step
 from web.errors import WebError
 from web.scene.surroundings import WorldPreview
 from web.state.feed import ArenaState
@@ -61,8 +62,9 @@ class WorldPanel:
         if self._change is not None and state.rig is not None and state.rig is not self._before:
             self._forget()
         placed = state.rig is not None and bool(state.rig.placed())
-        self._measure.show(enabled=placed and bool(state.cameras))
         is_ready = self._change is not None
+        is_next = next_step(state) == "floor" and not is_ready
+        self._measure.show(enabled=placed and bool(state.cameras), primary=is_next)
         self._accept.show(enabled=is_ready, primary=is_ready)
         self._discard.show(enabled=is_ready)
 
