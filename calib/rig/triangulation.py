@@ -16,7 +16,7 @@ from camera_node.geometry.pose import invert
 Visibility = Callable[[Camera, Array], Mask]
 
 MIN_ANGLE = 0.01  # rad between viewing rays, about: rays that are closer to parallel fix no point
-ITERATIONS = 8
+ITERATIONS, CONVERGED_M = 8, 1e-10
 REWEIGHTINGS = 8  # of many rays at once
 RAY_ANGLE = 0.003  # scale of Cauchy's weights of these: angle between a ray and the point, radians
 MIN_INFORMATION_RATIO = 1e-4  # along the worst and the best axis, below which these rays are parallel
@@ -38,12 +38,16 @@ def triangulate_point(cameras: Sequence[Camera], uv: ArrayLike) -> Array:
         CalibrationError: the rays are too close to parallel to fix a point, or they meet behind the cameras.
     """
     uv = np.asarray(uv, float)
-    p = _nearest_to_rays(cameras, uv)
+    poses = [camera.matrix() for camera in cameras]
+    p = _nearest_to_rays(cameras, poses, uv)
     for _ in range(ITERATIONS):
-        J, r = _linearize(cameras, uv, p)
+        J, r = _linearize(cameras, poses, uv, p)
         if not np.isfinite(J).all():
             break
-        p = p + np.linalg.lstsq(J, r)[0]
+        step = np.linalg.lstsq(J, r)[0]
+        p = p + step
+        if np.abs(step).max() < CONVERGED_M:
+            break
     if not np.isfinite(p).all():
         raise CalibrationError("the viewing rays meet behind the cameras")
     return p
@@ -70,10 +74,9 @@ def intersect(ray: Array, centre: Array, known: Mask, rounds: int = REWEIGHTINGS
     return points, angle
 
 
-def _nearest_to_rays(cameras: Sequence[Camera], uv: Array) -> Array:
+def _nearest_to_rays(cameras: Sequence[Camera], poses: Sequence[Array], uv: Array) -> Array:
     A, b = np.zeros((3, 3)), np.zeros(3)
-    for camera, pixel in zip(cameras, uv, strict=True):
-        T = camera.matrix()
+    for camera, T, pixel in zip(cameras, poses, uv, strict=True):
         d = T[:3, :3] @ camera.rays(pixel)[0]
         across = np.eye(3) - np.outer(d, d)
         A, b = A + across, b + across @ T[:3, 3]
@@ -82,11 +85,10 @@ def _nearest_to_rays(cameras: Sequence[Camera], uv: Array) -> Array:
     return np.asarray(np.linalg.solve(A, b), float)
 
 
-def _linearize(cameras: Sequence[Camera], uv: Array, p: Array) -> tuple[Array, Array]:
+def _linearize(cameras: Sequence[Camera], poses: Sequence[Array], uv: Array, p: Array) -> tuple[Array, Array]:
     """Jacobian (2N, 3) of the pixels by the point, and residuals (2N,): observed less predicted pixels."""
     jacobians, residuals = [], []
-    for camera, pixel in zip(cameras, uv, strict=True):
-        T = camera.matrix()
+    for camera, T, pixel in zip(cameras, poses, uv, strict=True):
         predicted, J = camera.project_with_jacobian(transform(invert(T), p))
         jacobians.append(J[0] @ T[:3, :3].T)
         residuals.append(pixel - predicted[0])
