@@ -13,6 +13,7 @@ namespace roundel {
 namespace {
 
 constexpr size_t kMaxRoundels = 4096;  // limit of a message
+constexpr size_t kMinWitnesses = 3;    // roundels that show a camera, of which one may be none
 constexpr int kMaxFits = 512;          // of seeds in a frame
 constexpr size_t kMaxLost = 8;         // lost roundels of a frame that are searched with motion blur
 constexpr int kMaxMovingFits = 32;     // of streaks in a frame,
@@ -43,17 +44,18 @@ Detector::Detector(RoundelLimits limits, double search_share, bool by_paper)
     limits_.prints = print_ratios_->prints();
 }
 
-Detector::FrameState::FrameState(const ImageView& given, const ImageView& linearized)
+Detector::FrameState::FrameState(const ImageView& given, const ImageView& linearized, bool known)
     : encoded(given),
       image(linearized),
       noise(noise_level(linearized)),
+      decided(known),
       suppression(given.width, given.height) {}
 
 FrameResult Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     // 1. Grey levels in proportion to light, as far as the response of this camera is known.
-    FrameState frame(image, response_.linearize(image));
+    FrameState frame(image, response_.linearize(image), knows_camera());
     // 2. The roundels of the last frame, at their predicted positions.
     const std::vector<ExpectedRoundel> lost = fit_tracked(frame);
     // 3. New ones: local thresholds and chords give seeds, rays from these a conic, the photometric fit the
@@ -70,6 +72,7 @@ FrameResult Detector::detect(const ImageView& image) {
     // 4. Roundels that moved during the exposure.
     fit_moving_tracked(lost, frame);
     fit_moving_streaks(candidates.streaks, frame);
+    const bool learned = decide(frame);
     // 5. Tracks, and what the next frame needs not search again.
     tracks_.update(frame.found);
     if (paper_)
@@ -77,8 +80,10 @@ FrameResult Detector::detect(const ImageView& image) {
     else
         mark_searched(parts, frame.found);
     // 6. What the roundels show of their prints and of the camera.
-    learn_prints(frame);
-    learn_camera(frame);
+    if (!learned) {
+        learn_prints(frame);
+        learn_camera(frame);
+    }
     for (TrackedFit& roundel : frame.found) bend_.claim(roundel.fit);
     return {std::move(frame.found), n_postponed_};
 }
@@ -203,7 +208,7 @@ void Detector::fit_moving_tracked(std::vector<ExpectedRoundel> lost, FrameState&
         };
         if (std::any_of(frame.found.begin(), frame.found.end(), is_same)) continue;
         const KnownRoundel known{expected->fit, expected->vx, expected->vy};
-        accept(fit_known_moving(frame.image, known, context(frame.noise)), expected->track, frame);
+        accept(fit_known_moving(frame.image, known, context(frame)), expected->track, frame);
     }
 }
 
@@ -223,12 +228,36 @@ void Detector::fit_moving_streaks(const std::vector<Streak>& streaks, FrameState
         if (failures >= may_fail || fits == kMaxMovingFits) break;
         if (frame.suppression.contains(guess.still.outer.x, guess.still.outer.y)) continue;
         ++fits;
-        failures += !accept(fit_new_moving(frame.image, guess, context(frame.noise)), -1, frame);
+        failures += !accept(fit_new_moving(frame.image, guess, context(frame)), -1, frame);
     }
 }
 
 /// Whether the camera's response is all that shapes the levels of a roundel.
 static bool shows_camera(const RoundelFit& fit) { return fit.unoccluded && !fit.fields.has_light(); }
+
+/// Decides on the roundels that a camera's tone curve and processing may explain, before both are known: all
+/// roundels of the frame show them together. Returns whether it has learned from the frame.
+bool Detector::decide(FrameState& frame) {
+    if (frame.undecided.empty()) return false;
+    frame.decided = true;
+    std::vector<const RoundelFit*> seen;
+    for (const TrackedFit& roundel : frame.found)
+        if (shows_camera(roundel.fit)) seen.push_back(&roundel.fit);
+    for (const RoundelFit& fit : frame.undecided) seen.push_back(&fit);
+    const bool learns = seen.size() >= kMinWitnesses;
+    if (learns) {
+        learn_prints(frame);
+        learn_response(seen);
+        frame.image = response_.linearize(frame.encoded);
+        frame.noise = noise_level(frame.image);
+    }
+    for (const RoundelFit& fit : frame.undecided)
+        fit_and_accept(
+            InitialGuess{fit.outer, fit.ratio, response_.linear(fit.dark), response_.linear(fit.bright)}, -1,
+            frame);
+    frame.undecided.clear();
+    return learns;
+}
 
 /// Learns which prints are in use. Rings of other ratios count as roundels all the same.
 void Detector::learn_prints(const FrameState& frame) {
@@ -236,6 +265,7 @@ void Detector::learn_prints(const FrameState& frame) {
     std::vector<PrintSample> samples;
     for (const TrackedFit& roundel : frame.found)
         if (shows_camera(roundel.fit)) samples.push_back({&roundel.fit, roundel.track});
+    for (const RoundelFit& fit : frame.undecided) samples.push_back({&fit, -1});
     if (print_ratios_->learn(samples)) use_prints();
 }
 
@@ -287,7 +317,7 @@ bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int trac
     if (!guess) return false;
     if (frame.suppression.contains(guess->outer.x, guess->outer.y)) return true;
     ++frame.n_fits;
-    return accept(fit_roundel(frame.image, *guess, context(frame.noise), track >= 0), track, frame);
+    return accept(fit_roundel(frame.image, *guess, context(frame), track >= 0), track, frame);
 }
 
 bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const {
@@ -299,6 +329,15 @@ bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameStat
     if (std::any_of(depths.begin(), depths.end(),
                     [&](double depth) { return is_bullseye(frame.image, *fit, depth); }))
         return false;
+    if (fit->provisional) {
+        const auto is_same = [&](const RoundelFit& other) {
+            return std::hypot(other.outer.x - fit->outer.x, other.outer.y - fit->outer.y) <
+                   fit->outer.minor / 2;
+        };
+        if (std::none_of(frame.undecided.begin(), frame.undecided.end(), is_same))
+            frame.undecided.push_back(*fit);
+        return false;
+    }
     frame.suppression.add(fit->outer);
     frame.found.push_back({*fit, track});
     return true;

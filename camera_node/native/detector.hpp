@@ -53,11 +53,13 @@ class Detector {
   private:
     /// What is found in one frame.
     struct FrameState {
-        FrameState(const ImageView& given, const ImageView& linearized);
+        FrameState(const ImageView& given, const ImageView& linearized, bool known);
         ImageView encoded, image;  // as the camera gives it, and with levels in proportion to light
         double noise;              // of `image`, grey levels
+        bool decided;              // the camera is known as well as this frame shows it
         Suppression suppression;
         std::vector<TrackedFit> found;
+        std::vector<RoundelFit> undecided;  // until the camera is known
         int n_fits = 0;
     };
     /// Places where roundels may be, in the image's frame.
@@ -76,6 +78,7 @@ class Detector {
     void fit_moving_streaks(const std::vector<Streak>& streaks, FrameState& frame) const;
     void update_theta(const std::vector<TrackedFit>& found);
     void mark_searched(const std::vector<Box>& parts, const std::vector<TrackedFit>& found);
+    bool decide(FrameState& frame);
     void learn_prints(const FrameState& frame);
     void use_prints();
     void learn_camera(const FrameState& frame);
@@ -84,13 +87,16 @@ class Detector {
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
     std::optional<InitialGuess> guess(const Seed& seed, const FrameState& frame) const;
-    AcceptanceContext context(double noise) const {
+    bool knows_camera() const { return response_.edge_noise() > 0; }
+    AcceptanceContext context(const FrameState& frame) const { return context(frame.noise, frame.decided); }
+    AcceptanceContext context(double noise, bool knows_camera = true) const {
         return {limits_,
                 light_,
                 noise,
                 response_.edge_noise(),
                 response_.curvature_sigma(),
                 response_.correlation(),
+                knows_camera,
                 &response_.remainder()};
     }
 

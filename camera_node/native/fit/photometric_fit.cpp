@@ -63,12 +63,14 @@ constexpr double kFieldChange = 0.1;  // of a standard deviation: a smaller step
 // Standard deviations of the fields:
 constexpr double kLightSigma = 0.3;   // light over its mean, and gloss over the contrast, up to second order
 constexpr double kCubicSigma = 0.05;  // the same of third order
-constexpr double kBendSigma = 0.02;   // height of bent paper over its width, as displacement with three
+constexpr double kBendSigma = 0.05;   // height of bent paper over its width, as displacement with three
                                       // periods at a tilt of 45 degrees
 constexpr double kLeastTilt = 0.05;
-// Residuals from which a fit is no roundel on bent paper, over the contrast: a bend of 2 % leaves 0.14 at 160
-// px.
-constexpr double kMaxBentResidual = 0.2;
+// Residuals from which a fit is no roundel on bent paper, over the contrast. A bend of 2 % leaves 0.14 at 160
+// px and residuals grow with bend and size, until edges are a blur away: 0.35 for one of 5 % there.
+constexpr double kBentResidual = 0.35 / 160;  // for each pixel of the diameter,
+constexpr double kLeastBentResidual = 0.2;    // at least this
+constexpr double kMostBentResidual = 0.7;     // and at most
 // Standard deviation of the level around a card in uneven light, over the contrast: no function of light is
 // as good there as on the print.
 constexpr double kUnevenGround = 0.04;
@@ -381,8 +383,10 @@ bool PhotometricFitter::shows_bend() {
     fields_.scores = score_fields(equations_, pixels_, FieldFrame(p_), step, {scale_, spread_});
     for (double* score : {&fields_.scores.bend, &fields_.scores.light, &fields_.scores.processing})
         *score /= square(noise_);
+    const double most =
+        std::clamp(kBentResidual * (p_[kAxx] + p_[kAyy]), kLeastBentResidual, kMostBentResidual);
     return allowed_ == AllowedFields::kBend && fields_.scores.bend > kUnlikelyField &&
-           scale_ < kMaxBentResidual * contrast();
+           scale_ < most * contrast();
 }
 
 /// The prior information on each field.

@@ -92,10 +92,11 @@ struct RoundelFit {
     /// of a patch of it; 0 if all pixels count alike.
     double ground = 0;
     Shading shading{};
-    bool clipped = false;    // the paper is brighter than the camera can show
-    bool uneven = false;     // the residuals show light that changes by more than the fit contains
-    double correlation = 1;  // of the residuals along the edges (`EdgeMisfit::correlation`)
-    Fields fields{};         // that the fit contains, in the image's frame
+    bool clipped = false;      // the paper is brighter than the camera can show
+    bool provisional = false;  // accepted if the camera's tone curve and processing explain it
+    bool uneven = false;       // the residuals show light that changes by more than the fit contains
+    double correlation = 1;    // of the residuals along the edges (`EdgeMisfit::correlation`)
+    Fields fields{};           // that the fit contains, in the image's frame
     Bend bend{};
     double contrast() const { return bright - dark; }
     /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.

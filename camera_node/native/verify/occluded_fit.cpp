@@ -8,6 +8,7 @@
 
 #include "fit/roundel_limits.hpp"
 #include "numeric/ray.hpp"
+#include "verify/print_ratios.hpp"
 
 namespace roundel {
 
@@ -24,6 +25,7 @@ constexpr int kMaxMasked = 26;            // sectors of 32, of one edge
 constexpr int kMaxMaskedOfBoth = 44;      // sectors of 64, of both edges
 constexpr double kMaxRatioError = 0.01;   // from the nearest print, beside its uncertainty: shows a bias
 constexpr double kMaxRatioSigma = 0.005;  // of that uncertainty
+constexpr double kMaxTone = 1.2;          // curvature of a tone curve that is not known: twice its spread
 constexpr double kMinKnown = 12;          // pixels: smaller ones contain too little information
 constexpr double kMinNew = 16;            // pixels: the same for new ones
 
@@ -122,11 +124,18 @@ bool masks_too_much(const OcclusionMask& mask) {
     return std::max(outer, inner) > kMaxMasked || outer + inner > kMaxMaskedOfBoth;
 }
 
+/// Whether most of the inner edge is masked and nothing of the outer one, across which a cover reaches it: a
+/// letter whose hole has another shape.
+bool hides_inner_edge_only(const OcclusionMask& mask) {
+    return !mask.outer && count_sectors(mask.inner) > kSectors / 2;
+}
+
 /// Whether the ratio is that of a print. Of a new roundel nothing else is known in advance. An occlusion that
 /// the residuals do not show biases the ratio as well as the position.
-bool has_print_ratio(const RoundelFit& fit, std::span<const Print> prints) {
-    return prints.empty() || std::abs(nearest_print(prints, fit.ratio).ratio - fit.ratio) <
-                                 std::hypot(kMaxRatioError, 2 * std::min(fit.ratio_sigma, kMaxRatioSigma));
+bool has_print_ratio(const RoundelFit& fit, std::span<const Print> prints, double slack) {
+    return prints.empty() ||
+           std::abs(nearest_print(prints, fit.ratio).ratio - fit.ratio) <
+               std::hypot(kMaxRatioError, 2 * std::min(fit.ratio_sigma, kMaxRatioSigma), slack);
 }
 
 }  // namespace
@@ -140,8 +149,8 @@ bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noi
 }
 
 bool is_certain_roundel(const ImageView& image, const RoundelFit& fit, const InitialGuess& guess,
-                        double noise) {
-    if (!has_print_ratio(fit, guess.prints)) return false;
+                        double noise, double ratio_slack) {
+    if (!has_print_ratio(fit, guess.prints, ratio_slack)) return false;
     const SectorView view(image, fit);
     return has_round_card(view) || !is_letter(view, fit, guess.occlusion, noise);
 }
@@ -173,8 +182,11 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
     if (!fit.is_explained(input.noise, kRestMisfit)) return std::nullopt;
     fit.correlation = EdgeMisfit(image, fit.p, fit.fields).correlation(fit.noise, guess.occlusion);
     fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / input.correlation));
-    return input.known || is_certain_roundel(image, fit, guess, input.noise) ? std::optional(fit)
-                                                                             : std::nullopt;
+    if (input.known) return fit;
+    if (hides_inner_edge_only(guess.occlusion)) return std::nullopt;
+    fit.provisional = !input.knows_camera;
+    const double tone = fit.provisional ? kMaxTone * ratio_by_curvature(fit, fit.ratio) : 0;
+    return is_certain_roundel(image, fit, guess, input.noise, tone) ? std::optional(fit) : std::nullopt;
 }
 
 }  // namespace roundel

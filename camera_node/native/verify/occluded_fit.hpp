@@ -19,7 +19,7 @@ bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noi
 /// that of a print within 0.01, and either it has a round card, or the levels of the parts that the guess
 /// leaves out are not those of ink and paper.
 bool is_certain_roundel(const ImageView& image, const RoundelFit& fit, const InitialGuess& guess,
-                        double noise);
+                        double noise, double ratio_slack = 0);
 
 /// The input of a fit to the visible part of a roundel.
 struct OccludedGuess {
@@ -29,6 +29,7 @@ struct OccludedGuess {
     double noise;                      // of the image, grey levels
     double correlation;                // of the camera's residuals
     bool known;                        // from the last frame
+    bool knows_camera;                 // its tone curve and its processing
 };
 
 /// Fits the visible part of a partly occluded roundel. Sectors of either edge with large residuals are masked

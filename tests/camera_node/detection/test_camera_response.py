@@ -55,6 +55,12 @@ def test_a_detector_with_other_settings_keeps_what_it_learned_about_the_camera(m
     assert mild.adjusted(min_contrast=20.0).tone_exponent == mild.tone_exponent > 1.5
 
 
+@pytest.mark.parametrize(("sensor", "share"), [(Sensor(tone="gamma"), 0.75), (MILD, 0.7), (HARSH, 0.4)])
+def test_one_picture_shows_what_its_camera_does_to_covered_roundels(sensor: Sensor, share: float):
+    """Roundels that are all covered show tone curve and processing together. The first frame had 2 % of them."""
+    assert share_found(Detector(), sensor, partial(covered, 0.2, False), 2) > share
+
+
 def test_contrast_is_judged_before_the_picture_is_made_linear():
     """Ink of 47 and paper of 88 differ by 18 linear levels: a detector that knows the tone curve finds them, too."""
     assert faint_found(Detector(), 1) == faint_found(known(Sensor(tone="gamma")), 1) == 1

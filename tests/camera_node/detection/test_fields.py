@@ -24,6 +24,13 @@ def test_a_bend_is_removed_from_the_outline_and_its_unknown_part_is_claimed(diam
     assert measured.size < CLAIM
 
 
+def test_strongly_bent_paper_is_found_when_large():
+    """Edges are displaced in proportion to the size: 5 % of 160 px was refused for its residuals."""
+    measured = measure_bend(RUN, 0.05, 160, 8)
+    assert measured.found > 0.9
+    assert measured.centre < CLAIM
+
+
 @pytest.mark.parametrize("diameter", [40, 80])
 def test_flat_paper_is_not_taken_for_bent(diameter):
     """Mean squared errors of 16 coordinates have a standard deviation of 0.35; three of them below the mean."""
