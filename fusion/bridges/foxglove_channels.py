@@ -42,13 +42,24 @@ class FoxgloveChannels:
         self._messages = require("foxglove.messages", "foxglove", "Foxglove")
         self._open: dict[str, Any] = {}
         self._states: dict[str, str] = {}
+        self._bodies: Mapping[str, Robot] = {}
+        for topic, schema in (("/log", "Log"), ("/scene", "SceneUpdate")):
+            self._channel(
+                topic, schema
+            )  # a client subscribes to a channel that it knows: a first line must not be lost
 
     def add_poses(self, poses: Sequence[RobotPose]) -> None:
-        """Log the transforms of robots that are not lost, `/robots/NAME/pose`, and changes of their states."""
+        """Log the transforms of robots that are not lost, `/robots/NAME/pose`, and changes of their states.
+
+        A lost robot is removed from `/scene` until it is tracked again: its transform would stay where it was.
+        """
         for pose in poses:
-            if self._states.setdefault(pose.robot, pose.state) != pose.state:
-                self.add_log(f"{pose.robot} is {pose.state}", pose.t_ns, is_warning=pose.state == "lost")
+            before = self._states.get(pose.robot, pose.state)
             self._states[pose.robot] = pose.state
+            if before != pose.state:
+                self.add_log(f"{pose.robot} is {pose.state}", pose.t_ns, is_warning=pose.state == "lost")
+            if "lost" in (before, pose.state) and before != pose.state:
+                self._show(pose)
         shown = [pose for pose in poses if pose.state != "lost"]
         if not shown:
             return
@@ -89,12 +100,27 @@ class FoxgloveChannels:
         )
 
     def add_bodies(self, bodies: Mapping[str, Robot], t_ns: int) -> None:
-        """Log `/scene`: each robot's roundels and name, fixed to its frame; robots that are gone are removed."""
-        m = self._messages
-        entities = [self._body(name, body, t_ns) for name, body in bodies.items()]
+        """Log `/scene`: each robot's roundels and name, fixed to its frame; those that are gone or lost are removed."""
+        m, self._bodies = self._messages, bodies
+        entities = [
+            self._body(name, body, t_ns) for name, body in bodies.items() if self._states.get(name) != "lost"
+        ]
         wipe = m.SceneEntityDeletion(timestamp=self._time(t_ns), type=m.SceneEntityDeletionType.All)
         update = m.SceneUpdate(deletions=[wipe], entities=entities)
         self._channel("/scene", "SceneUpdate").log(update, log_time=t_ns)
+
+    def _show(self, pose: RobotPose) -> None:
+        """Log to `/scene` that a robot is there again, or is lost."""
+        m, body = self._messages, self._bodies.get(pose.robot)
+        if pose.state == "lost":
+            kind = m.SceneEntityDeletionType.MatchingId
+            gone = m.SceneEntityDeletion(timestamp=self._time(pose.t_ns), type=kind, id=pose.robot)
+            update = m.SceneUpdate(deletions=[gone])
+        elif body is not None:
+            update = m.SceneUpdate(entities=[self._body(pose.robot, body, pose.t_ns)])
+        else:
+            return
+        self._channel("/scene", "SceneUpdate").log(update, log_time=pose.t_ns)
 
     def add_markers(self, markers: Markers) -> None:
         """Log `/markers`: the unlabeled markers, which disappear after half a second."""

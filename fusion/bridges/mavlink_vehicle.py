@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One robot's poses to an autopilot (PX4, ArduPilot) over MAVLink 2 and UDP: ODOMETRY or VISION_POSITION_ESTIMATE.
 
-The autopilot asks for our time by TIMESYNC; the answer is the server's time, in which the poses are stamped.
+The autopilot asks for our time by TIMESYNC; the answer is the server's time, in which the poses are stamped. While the
+robot is lost, heartbeats have the state critical, and ODOMETRY says by its quality that the odometry has failed.
 """
 
 import re
@@ -14,15 +15,16 @@ from typing import Any, Literal
 from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.foundation.extras import require
 from camera_node.geometry.pose import wxyz_from_rotation
-from camera_node.node.clock_sync import ClockSync
 from fusion.bridges.mavlink_frames import FrdFrames, FrdPose, roll_pitch_yaw, upper_triangle
 from fusion.bridges.pose_queue import WAIT_S, PoseQueue
+from fusion.client.server_time import ServerTimeReader
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
 
 ADDRESS = re.compile(r"udp:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):(?P<port>\d{1,5})")
 HEARTBEAT_S = 1.0
 GAP_S = 1.0  # without poses, after which the next one counts as a reset
 MAX_DATAGRAMS = 64  # taken at a time
+UNKNOWN, FAILED = 0, -1  # of ODOMETRY's quality
 
 
 class RateDivider:
@@ -113,22 +115,29 @@ class MavlinkVehicle:
         """Of the socket, for `select`."""
         return self._socket.fileno()
 
-    def beat(self) -> None:
-        """Send a heartbeat if one is due: routers forward to programs that have one."""
-        if time.monotonic() >= self._heartbeat_s:
-            self._heartbeat_s = time.monotonic() + HEARTBEAT_S
-            m = self._mavlink
-            self._send(
-                m.MAVLink_heartbeat_message(
-                    m.MAV_TYPE_ONBOARD_CONTROLLER, m.MAV_AUTOPILOT_INVALID, 0, 0, m.MAV_STATE_ACTIVE, 3
-                )
-            )
+    def beat(self, condition: Literal["STANDBY", "ACTIVE", "CRITICAL"]) -> bool:
+        """Send a heartbeat if one is due, and return whether it is: routers forward to programs that have one.
 
-    def answer(self, now_ns: int) -> None:
+        Args:
+            condition: MAVLink's state: before the first pose, with poses, and while the robot is lost.
+        """
+        if time.monotonic() < self._heartbeat_s:
+            return False
+        self._heartbeat_s = time.monotonic() + HEARTBEAT_S
+        m = self._mavlink
+        state = getattr(m, f"MAV_STATE_{condition}")
+        self._send(
+            m.MAVLink_heartbeat_message(
+                m.MAV_TYPE_ONBOARD_CONTROLLER, m.MAV_AUTOPILOT_INVALID, 0, 0, state, 3
+            )
+        )
+        return True
+
+    def answer(self, now_ns: int | None) -> None:
         """Answer the requests for the time that have arrived.
 
         Args:
-            now_ns: the server's present time.
+            now_ns: the server's present time; None if it is not known: then nothing is answered.
         """
         for _ in range(MAX_DATAGRAMS):
             try:
@@ -138,10 +147,10 @@ class MavlinkVehicle:
             except OSError:  # nothing listens there yet
                 continue
             for message in self._parse(data):
-                if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                if now_ns is not None and message.get_type() == "TIMESYNC" and message.tc1 == 0:
                     self._send(self._mavlink.MAVLink_timesync_message(now_ns, message.ts1))
 
-    def send_odometry(self, t_ns: int, pose: FrdPose, resets: int) -> None:
+    def send_odometry(self, t_ns: int, pose: FrdPose, resets: int, quality: int = UNKNOWN) -> None:
         """Send ODOMETRY in MAV_FRAME_LOCAL_FRD, with the velocity in MAV_FRAME_BODY_FRD."""
         m = self._mavlink
         message = m.MAVLink_odometry_message(
@@ -155,6 +164,7 @@ class MavlinkVehicle:
             upper_triangle(pose.twist_covariance),
             resets,
             m.MAV_ESTIMATOR_TYPE_MOCAP,
+            quality,
         )
         self._send(message)
 
@@ -200,20 +210,43 @@ class MavlinkBridge:
     ) -> None:
         self.resets = ResetCounter()
         self._vehicle, self._frames, self._rate = vehicle, frames, rate
-        self._send = vehicle.send_odometry if kind == "odometry" else vehicle.send_vision
+        self._kind = kind
+        self._last: RobotPose | None = None  # that was sent
+        self._is_lost = False
 
-    def step(self, poses: PoseQueue, clock: ClockSync) -> None:
+    def step(self, poses: PoseQueue, clock: ServerTimeReader) -> None:
         """Wait for poses and requests, at most `WAIT_S`, and pass them on."""
         select.select([poses, self._vehicle], [], [], WAIT_S)
-        self._vehicle.beat()
         self._vehicle.answer(clock.now_ns())
         for pose in poses.take():
             if pose.state == "lost":
-                self.resets.add_loss()
-                continue
-            self.resets.add_pose(pose)
-            if self._rate.passes(pose.t_ns):
-                self._send(pose.t_ns, self._frames.convert(pose), self.resets.count)
+                self._lose(pose.t_ns)
+            else:
+                self._pass_on(pose)
+        is_due = self._vehicle.beat(
+            "STANDBY" if self._last is None else "CRITICAL" if self._is_lost else "ACTIVE"
+        )
+        if is_due and self._is_lost:  # again: UDP may have lost it
+            self._send_failure(clock.now_ns())
+
+    def _pass_on(self, pose: RobotPose) -> None:
+        self.resets.add_pose(pose)
+        if not self._rate.passes(pose.t_ns):
+            return
+        self._last, self._is_lost = pose, False
+        send = self._vehicle.send_odometry if self._kind == "odometry" else self._vehicle.send_vision
+        send(pose.t_ns, self._frames.convert(pose), self.resets.count)
+
+    def _lose(self, t_ns: int) -> None:
+        self.resets.add_loss()
+        if self._last is not None and not self._is_lost:
+            self._is_lost = True
+            self._send_failure(t_ns)
+
+    def _send_failure(self, t_ns: int | None) -> None:
+        """Say that there is no odometry; VISION_POSITION_ESTIMATE has no field for it, and just stops."""
+        if self._kind == "odometry" and self._last is not None and t_ns is not None:
+            self._vehicle.send_odometry(t_ns, self._frames.convert(self._last), self.resets.count, FAILED)
 
 
 def connect(to: str) -> socket.socket:

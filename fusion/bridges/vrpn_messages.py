@@ -17,13 +17,15 @@ from fusion.protocol.pose_messages import RobotPose
 COOKIE = b"vrpn: ver. 07.35  0".ljust(24, b"\0")  # the digit: the server is not to write a log
 COOKIE_START = b"vrpn: ver. 07."
 SENDER_DESCRIPTION, TYPE_DESCRIPTION, UDP_DESCRIPTION = -1, -2, -3
-POSITION, VELOCITY, PONG, PING = range(4)  # our numbers of types
+POSITION, VELOCITY, PONG, PING, TEXT = range(5)  # our numbers of types
 TYPES = {
     POSITION: "vrpn_Tracker Pos_Quat",
     VELOCITY: "vrpn_Tracker Velocity",
     PONG: "vrpn_Base pong_message",
     PING: "vrpn_Base ping_message",
+    TEXT: "vrpn_Base text_message",
 }
+NORMAL, WARNING = 0, 1  # severities of a text
 VELOCITY_S = 0.01  # a turn is reported as the rotation in this time; above 300 rad/s it would be ambiguous
 MAX_MESSAGE = 1 << 16  # bytes; clients send pings and names
 HEADER = struct.Struct(">iiiiiI")
@@ -76,6 +78,12 @@ def reports(pose: RobotPose, sender: int, sequence: int) -> bytes:
     return message(position, sender, POSITION, pose.t_ns, sequence) + message(
         velocity, sender, VELOCITY, pose.t_ns, sequence + 1
     )
+
+
+def text(words: str, sender: int, severity: int, t_ns: int, sequence: int) -> bytes:
+    """Encode a text of a sender, which VRPN's clients print (vrpn_BaseClass.C): severity, level 0, words to a zero."""
+    body = struct.pack(">II", severity, 0) + words.encode() + b"\0"
+    return message(body, sender, TEXT, t_ns, sequence)
 
 
 def turn(angular_velocity: tuple[float, float, float]) -> tuple[float, float, float, float]:

@@ -142,6 +142,7 @@ class VrpnServer:
     def __init__(self, host: str = "127.0.0.1", port: int = 3883) -> None:
         self.faults: Counter[str] = Counter()
         self._senders: dict[str, int] = {}
+        self._lost: set[str] = set()  # robots of which the clients know it
         self._sequence = 0
         self._clients: list[VrpnClient] = []
         self._selector = selectors.DefaultSelector()
@@ -175,11 +176,26 @@ class VrpnServer:
                 self._drop(client, "clients that sent no cookie")
 
     def publish(self, poses: list[RobotPose]) -> None:
-        """Report the poses of robots that are not lost to all clients."""
+        """Report the poses of robots that are not lost to all clients, and by a text which ones became lost."""
         data = [self._encode(pose) for pose in poses if pose.state != "lost"]
         for client in tuple(self._clients):
             if data and client.is_ready:
                 self._attempt(client, VrpnClient.report, data)
+        for pose in poses:
+            self._report_state(pose)
+
+    def _report_state(self, pose: RobotPose) -> None:
+        is_lost = pose.state == "lost"
+        if pose.robot not in self._senders or is_lost == (pose.robot in self._lost):
+            return
+        self._lost ^= {pose.robot}
+        words = f"{pose.robot} is {pose.state}"
+        self._sequence += 1
+        severity = vrpn.WARNING if is_lost else vrpn.NORMAL
+        data = vrpn.text(words, self._senders[pose.robot], severity, pose.t_ns, self._sequence)
+        for client in tuple(self._clients):
+            if client.is_ready:
+                self._attempt(client, VrpnClient.send, data)
 
     def _encode(self, pose: RobotPose) -> bytes:
         sender = self._senders.get(pose.robot)

@@ -33,7 +33,8 @@ from camera_node.protocol.presence import Presence, no_such
 from camera_node.protocol.requests import RETRY_S, RequestSource
 from camera_node.protocol.server_connection import LOCAL_SERVER, ServerConnection
 from camera_node.protocol.session import ask_server, guarded
-from fusion.client.streams import RobotStream, Stream
+from fusion.client.server_time import ServerTimeReader
+from fusion.client.streams import RobotStream, Stream, since_arrival
 from fusion.model.robots import Robot as RobotBody
 from fusion.protocol.arena_health import why_no_frames, why_no_markers, why_no_poses
 from fusion.protocol.pose_messages import FusionStatus, Markers, RobotPose, RobotPoses, Robots, RobotsRequest
@@ -45,7 +46,11 @@ STATUS_S = 3.0  # a server sends its status every second
 
 
 class Arena:
-    """A connection to an arena's server. `faults` counts undecodable messages, by kind.
+    """A connection to an arena's server.
+
+    Attributes:
+        faults: undecodable messages, by kind.
+        time: the server's time.
 
     Args:
         connection: to the server; it is closed with the arena.
@@ -61,13 +66,14 @@ class Arena:
         self._lock = threading.Lock()
         self._robots: dict[str, RobotStream] = {}
         self._streams: dict[str, Stream] = {}
-        self._newest: dict[str, RobotPose] = {}
+        self._newest: dict[str, tuple[RobotPose, float]] = {}  # and when it arrived
+        self.time = ServerTimeReader(connection, self.keys)
         self._presence = Presence(arena, self.keys.camera_alive())
         connection.when_open(self._presence.watch)
         self._server_status: tuple[float, FusionStatus] | None = None  # when it arrived
         poses, cause = f"poses {self._origin}", self.why_no_poses
-        self._all: Stream[RobotPose] = Stream(poses, TIMEOUT_S, cause)
-        self._sets: Stream[Sequence[RobotPose]] = Stream(poses, TIMEOUT_S, cause)
+        self._all: Stream[RobotPose] = Stream(poses, TIMEOUT_S, cause, self._age)
+        self._sets: Stream[Sequence[RobotPose]] = Stream(poses, TIMEOUT_S, cause, self._age_of_set)
         self._subscribe(
             self.keys.fusion_status, guarded("status", self._taker(FusionStatus, self._keep_status))
         )
@@ -109,6 +115,7 @@ class Arena:
         """End all iterations and the connection."""
         for stream in (self._all, self._sets, *self._robots.values(), *self._streams.values()):
             stream._close()
+        self.time.close()
         self.connection.close()
 
     def robot(self, name: str, timeout_s: float | None = TIMEOUT_S) -> RobotStream:
@@ -116,10 +123,10 @@ class Arena:
         with self._lock:
             if name not in self._robots:
                 content = f"pose of '{name}' {self._origin}"
-                stream = RobotStream(content, timeout_s, lambda: self.why_no_poses(name))
+                stream = RobotStream(content, timeout_s, lambda: self.why_no_poses(name), self._age)
                 self._robots[name] = stream
                 if name in self._newest:
-                    stream._put(self._newest[name])
+                    stream._put(*self._newest[name])
             robot = self._robots[name]
         robot.timeout_s = timeout_s
         return robot
@@ -136,6 +143,10 @@ class Arena:
         """
         self._sets.timeout_s = timeout_s
         return self._sets
+
+    def age_s(self, message: RobotPose | Markers | FusionStatus) -> float:
+        """The age of a message that a callback or an iteration received, seconds; as `Stream.age_s`."""
+        return self.time.read().age_s(message.t_ns, time.monotonic())
 
     def why_no_poses(self, robot: str | None = None) -> str:
         """The cause why no pose arrives, of a robot or of any, in one sentence with what to do. It asks nobody.
@@ -225,13 +236,18 @@ class Arena:
     def markers(self, timeout_s: float | None = TIMEOUT_S) -> Stream[Markers]:
         """All markers of every frame set."""
         return self._stream(
-            self.keys.markers, Markers, "markers", timeout_s, lambda: self._why(why_no_markers)
+            self.keys.markers, Markers, "markers", timeout_s, lambda: self._why(why_no_markers), self._age
         )
 
     def status(self, timeout_s: float | None = TIMEOUT_S) -> Stream[FusionStatus]:
         """The server's status, once a second."""
         return self._stream(
-            self.keys.fusion_status, FusionStatus, "status", timeout_s, lambda: self._why(lambda _: "")
+            self.keys.fusion_status,
+            FusionStatus,
+            "status",
+            timeout_s,
+            lambda: self._why(lambda _: ""),
+            self._age,
         )
 
     def camera_statuses(self, timeout_s: float | None = TIMEOUT_S) -> Stream[CameraStatus]:
@@ -301,11 +317,23 @@ class Arena:
             else f"no camera runs there: start {command}"
         )
 
+    def _age(self, message: RobotPose | Markers | FusionStatus, received_s: float) -> float:
+        return self.time.read().age_s(message.t_ns, received_s)
+
+    def _age_of_set(self, poses: Sequence[RobotPose], received_s: float) -> float:
+        return self._age(poses[0], received_s)
+
     def _stream(
-        self, key: str, kind: type, content: str, timeout_s: float | None, cause: Callable[[], str]
+        self,
+        key: str,
+        kind: type,
+        content: str,
+        timeout_s: float | None,
+        cause: Callable[[], str],
+        age: Callable[[Any, float], float] = since_arrival,
     ) -> Stream:
         if key not in self._streams:
-            stream = self._streams[key] = Stream(f"{content} {self._origin}", timeout_s, cause)
+            stream = self._streams[key] = Stream(f"{content} {self._origin}", timeout_s, cause, age)
             take = guarded(content, self._taker(kind, stream._put))
             self._subscribe(key, take)
         self._streams[key].timeout_s = timeout_s
@@ -354,7 +382,7 @@ class Arena:
         with self._lock:
             is_admitted = pose.robot in self._newest or len(self._newest) < MAX_ROBOTS
             if is_admitted:
-                self._newest[pose.robot] = pose
+                self._newest[pose.robot] = pose, time.monotonic()
             else:
                 self.faults["RobotPose"] += 1
         return is_admitted

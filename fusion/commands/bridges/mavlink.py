@@ -9,7 +9,6 @@ import tyro
 from camera_node.foundation.config import require_name
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
-from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.bridges.mavlink_frames import FrdFrames
 from fusion.bridges.mavlink_vehicle import MavlinkBridge, MavlinkVehicle, RateDivider
@@ -62,12 +61,10 @@ def mavlink(
     ):
         bridge = MavlinkBridge(autopilot, converter, rate, message)
         poses.client.status().on_message(bridge.resets.add_status)
-        if (session := poses.client.connection.wait_unless(stop)) is None:
+        if poses.client.connection.wait_unless(stop) is None:
             return 0
-        clock = ClockSync(session, poses.client.keys).start()
         say(f"MAVLink: '{robot}' to {to}")
         while not stop.is_set():
-            bridge.step(poses, clock)
-        clock.close()
+            bridge.step(poses, poses.client.time)
         log_faults(autopilot.faults)
     return 0

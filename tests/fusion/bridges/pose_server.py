@@ -3,9 +3,10 @@
 
 import contextlib
 import subprocess
+import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import zenoh
@@ -13,8 +14,10 @@ import zenoh
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
 from camera_node.protocol.messages import ClockReply, Keys, encode
 from camera_node.protocol.session import open_router
-from fusion.protocol.pose_messages import RobotPose, RobotPoses
-from tests.processes import running
+from fusion.model.limits import Limits
+from fusion.protocol.pose_messages import FusionStatus, RobotPose, RobotPoses
+from tests.conftest import ROOT
+from tests.processes import first_line, killed_at_end, running
 from tests.waiting import DEADLINE_S, wait_for
 
 START_S = (
@@ -44,6 +47,21 @@ def moving_pose(robot: str, t_ns: int, seed: int = 1, state: str = "tracked") ->
     )
 
 
+def status(t_ns: int, limits: Limits) -> FusionStatus:
+    """The status of a server without cameras."""
+    return FusionStatus(
+        t_ns=t_ns,
+        frame_sets_per_s=RATE_HZ,
+        latency_ms=None,
+        cpu=0.0,
+        memory_mb=0.0,
+        cameras={},
+        robots={},
+        faults={},
+        limits=limits,
+    )
+
+
 def publish_poses(session: zenoh.Session, poses: Sequence[RobotPose]) -> None:
     """Publish poses as a server does: all in one message, and each on the key of its robot."""
     encoded = {Keys(ARENA).robot_pose(pose.robot): encode(pose) for pose in poses}
@@ -59,15 +77,22 @@ class PoseServer:
         endpoint: to listen on.
         robots: the names of those that are tracked.
         ahead_ns: the server's time minus this machine's.
+        lateness_ms: of the limits in its status: poses that are older by that are passed on by bridges. A busy machine
+            delays a bridge by seconds, and only tests of too old poses give the server's own.
 
     Attributes:
         published: all poses, by robot and time.
     """
 
     def __init__(
-        self, endpoint: str, robots: tuple[str, ...] = ("rover", "drone"), ahead_ns: int = 0
+        self,
+        endpoint: str,
+        robots: tuple[str, ...] = ("rover", "drone"),
+        ahead_ns: int = 0,
+        lateness_ms: float = 1e3 * DEADLINE_S,
     ) -> None:
         self.endpoint, self.robots, self._ahead_ns = endpoint, robots, ahead_ns
+        self._limits = Limits(lateness_ms=lateness_ms)
         self.published: dict[tuple[str, int], RobotPose] = {}
         self._keys = Keys(ARENA)
 
@@ -102,6 +127,7 @@ class PoseServer:
     def _run(self, session: zenoh.Session) -> None:
         while not self._stopped.wait(1 / RATE_HZ):
             t_ns = self.now_ns()
+            session.put(self._keys.fusion_status, encode(status(t_ns, self._limits)))
             for seed, robot in enumerate((*self.robots, "gone")):
                 pose = moving_pose(robot, t_ns, seed, "lost" if robot == "gone" else "tracked")
                 self.published[robot, t_ns] = pose
@@ -121,3 +147,26 @@ def restart(server: PoseServer) -> int:
     server.start()
     wait_for(lambda: max(t for _, t in server.published) > t_ns)
     return t_ns
+
+
+def main(endpoint: str, lateness_ms: str) -> None:
+    """Serve the rover until the process is killed, and print a line once its poses are published."""
+    with PoseServer(endpoint, ("rover",), lateness_ms=float(lateness_ms)) as server:
+        wait_for(lambda: server.published)
+        print("publishes", flush=True)
+        threading.Event().wait()
+
+
+@contextlib.contextmanager
+def server_process(
+    endpoint: str, lateness_ms: float = Limits().lateness_ms
+) -> Iterator[subprocess.Popen[str]]:
+    """A `PoseServer` of the rover in a process of its own, to be killed; it publishes."""
+    words = [sys.executable, "-m", "tests.fusion.bridges.pose_server", endpoint, str(lateness_ms)]
+    with killed_at_end(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        first_line(process)
+        yield process
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

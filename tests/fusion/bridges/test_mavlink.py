@@ -205,7 +205,7 @@ def test_resets_count_losses_gaps_and_calibrations():
 
 def test_bytes_that_are_not_mavlink_do_not_end_the_bridge():
     with Autopilot() as autopilot, MavlinkVehicle(f"udp:127.0.0.1:{autopilot.port}") as vehicle:
-        vehicle.beat()
+        vehicle.beat("ACTIVE")
         autopilot.receive("HEARTBEAT")
         rng = np.random.default_rng(1)
         for size in (1, 3, 12, 280, 2000):

@@ -27,10 +27,10 @@ MICROSECOND_NS = 1000
 
 
 @contextlib.contextmanager
-def serving(server: PoseServer) -> Iterator[int]:
+def serving(endpoint: str) -> Iterator[int]:
     """The port of a VRPN bridge."""
     port = free_port()
-    with bridge("vrpn", "--connect", server.endpoint, "--port", str(port)) as process:
+    with bridge("vrpn", "--connect", endpoint, "--port", str(port)) as process:
         assert str(port) in first_line(process)
         yield port
 
@@ -119,7 +119,7 @@ class VrpnReader:
 def test_vrpns_own_client_reads_the_robots(endpoint: str, scheme: str):
     with (
         PoseServer(endpoint) as server,
-        serving(server) as port,
+        serving(endpoint) as port,
         motion_capture(f"{scheme}127.0.0.1:{port}") as frames,
     ):
         received = [
@@ -138,7 +138,7 @@ def test_vrpns_own_client_reads_the_robots(endpoint: str, scheme: str):
 @pytest.mark.parametrize("udp", [False, True])
 def test_every_pose_arrives_once_with_its_time_and_velocity(endpoint: str, udp: bool):
     times: dict[str, list[int]] = {"rover": [], "drone": []}
-    with PoseServer(endpoint) as server, serving(server) as port, VrpnReader(port, udp) as reader:
+    with PoseServer(endpoint) as server, serving(endpoint) as port, VrpnReader(port, udp) as reader:
         reader.await_names(2)
         messages = []
         while len(messages) < 200:
@@ -169,7 +169,7 @@ def test_every_pose_arrives_once_with_its_time_and_velocity(endpoint: str, udp: 
 
 
 def test_a_ping_is_answered_in_the_trackers_name(endpoint: str):
-    with PoseServer(endpoint) as server, serving(server) as port, VrpnReader(port) as reader:
+    with PoseServer(endpoint), serving(endpoint) as port, VrpnReader(port) as reader:
         while reader.next()[0] != "drone":
             pass
         for kind, number, name in ((-1, 7, b"drone\0"), (-2, 5, b"vrpn_Base ping_message\0")):
@@ -181,7 +181,7 @@ def test_a_ping_is_answered_in_the_trackers_name(endpoint: str):
 
 
 def test_clients_stay_connected_while_the_server_restarts(endpoint: str):
-    with PoseServer(endpoint) as server, serving(server) as port, VrpnReader(port) as reader:
+    with PoseServer(endpoint) as server, serving(endpoint) as port, VrpnReader(port) as reader:
         reader.next()
         since_ns = restart(server)
         while reader.next()[2] <= since_ns:
@@ -195,7 +195,7 @@ def test_hostile_clients_do_not_end_the_bridge(endpoint: str):
         b"vrpn: ver. 07.35  0\0\0\0\0\0" + struct.pack(">6i", -8, 0, 0, 0, -1, 0),
         b"vrpn: ver. 07.35  0\0\0\0\0\0" + struct.pack(">6ii", 28, 0, 0, 0, -1, 0, 2**31 - 1) + bytes(4),
     )
-    with PoseServer(endpoint) as server, serving(server) as port:
+    with PoseServer(endpoint), serving(endpoint) as port:
         for data in hostile:
             with socket.create_connection(("127.0.0.1", port), DEADLINE_S) as connection:
                 connection.sendall(data)

@@ -11,10 +11,12 @@ from tests.fusion.bridges.pose_server import ARENA, PoseServer
 from tests.pages import programs
 from tests.waiting import DEADLINE_S
 
-FIRST, CALLBACK = programs("clients.md")
+FIRST, CALLBACK, AGE = programs("clients.md")
 
 
-@pytest.mark.parametrize(("program", "expected"), [(FIRST, "tracked"), (CALLBACK, "3 robots at")])
+@pytest.mark.parametrize(
+    ("program", "expected"), [(FIRST, "tracked"), (CALLBACK, "3 robots at"), (AGE, " s old")]
+)
 def test_a_program_prints_poses(program: str, expected: str):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     program = program.replace("tcp/localhost:7447", endpoint).replace('arena="demo"', f'arena="{ARENA}"')
