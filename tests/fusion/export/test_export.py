@@ -239,8 +239,10 @@ def test_a_file_for_foxglove_has_the_arena(recording: Path, tmp_path: Path):
         positions = [(m.pose.position.x, m.pose.position.y, m.pose.position.z) for _, m in messages]
         assert positions == [p.position for p in expected]
     assert len(found["/tf"]) == 2 * N - len(LOST)
-    ((_, scene),) = found["/scene"]
+    (_, scene), (_, lost), (_, tracked) = found["/scene"]
     assert {(e.id, len(e.cylinders)) for e in scene.entities} == {("rover", 3), ("drone", 1)}
+    assert [deletion.id for deletion in lost.deletions] == ["drone"]  # a lost robot is not shown where it was
+    assert [entity.id for entity in tracked.entities] == ["drone"]
     assert [m.message for _, m in found["/log"]] == ["drone is lost", "drone is tracked"]
 
 
