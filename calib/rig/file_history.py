@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.errors import CalibrationError
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, describe_failed_write
 
 MAX_OLD = 20  # versions that are kept
 
@@ -99,7 +99,6 @@ class History:
     def _restore(self, version: Path, other: "_Series") -> HistoryStep:
         with self._reporting("restored"):
             replaced = other.add(self.path) if self.path.exists() else None
-            os.utime(version)  # it is in force from now on: newer than other files
             os.replace(version, self.path)
         return HistoryStep(version, replaced)
 
@@ -108,7 +107,7 @@ class History:
         try:
             yield
         except OSError as error:
-            raise ConfigError(f"{self.path} can't be {verb}: {error.strerror}; check its folder") from None
+            raise ConfigError(f"{self.path} can't be {verb}: {describe_failed_write(error)}") from None
 
 
 class _Series:

@@ -5,6 +5,7 @@ A change says what differs from the rig before, when it was made and by whom. A 
 its first line, so that a numbered version takes it along. Messages are encoded as in `camera_node.protocol.messages`.
 """
 
+import hashlib
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -64,6 +65,34 @@ def read_change(path: Path) -> RigChange:
         except (msgspec.MsgspecError, ValueError):  # edited by hand
             pass
     return RigChange(t_ns=path.stat().st_mtime_ns)
+
+
+class SavedChange(RigChange, frozen=True, kw_only=True, omit_defaults=True):
+    """The first line of a file that a server saved.
+
+    Attributes:
+        given: the digest of the user's file in place of which it is used (`file_digest`).
+    """
+
+    given: str = ""
+
+
+def file_digest(path: Path | None) -> str:
+    """What distinguishes a file's content from others: the start of its SHA-256; empty of a file that can't be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:32] if path is not None else ""
+    except OSError:
+        return ""
+
+
+def read_given(path: Path) -> str | None:
+    """The digest in the first line of a file that a server saved; None if there is none, as of older versions."""
+    try:
+        with path.open("rb") as file:
+            line = file.readline(MAX_LINE)
+        return msgspec.json.decode(line.removeprefix(MARK.encode()), type=SavedChange).given or None
+    except (OSError, msgspec.MsgspecError, ValueError):
+        return None
 
 
 def holds_rig(path: Path, rig: Rig) -> bool:

@@ -4,6 +4,7 @@
 A file is read in bounded time and memory: PyYAML and libyaml recurse, and expand aliases without a limit.
 """
 
+import contextlib
 import difflib
 import os
 import re
@@ -17,7 +18,7 @@ import msgspec
 import numpy as np
 import yaml
 
-from camera_node.foundation.errors import ConfigError, printable
+from camera_node.foundation.errors import ConfigError, describe_failed_write, printable
 
 T = TypeVar("T")
 NAME = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
@@ -143,10 +144,11 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             os.chmod(name, 0o644)
             os.replace(name, path)
         except BaseException:
-            os.unlink(name)
+            with contextlib.suppress(OSError):  # what went wrong first is to be reported
+                os.unlink(name)
             raise
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}; does its folder exist?") from None
+        raise ConfigError(f"{path} can't be written: {describe_failed_write(error)}") from None
 
 
 class _Dumper(yaml.SafeDumper):

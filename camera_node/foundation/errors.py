@@ -16,6 +16,7 @@ Every message names the fault, its place and the remedy. Faults in live data are
 The exit code tells a service manager whether to retry: 2 stays until a user acts, 75 (EX_TEMPFAIL) may pass by itself.
 """
 
+import errno
 from typing import ClassVar
 
 USER_ERROR, TEMPORARY_FAILURE = 2, 75  # exit codes; the second is EX_TEMPFAIL of sysexits.h
@@ -60,3 +61,14 @@ def printable(text: object, limit: int = MAX_LINE) -> str:
     shown = str(text)[: limit + 1]
     escaped = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
     return escaped if len(escaped) <= limit else escaped[:limit] + "..."
+
+
+def describe_failed_write(error: OSError) -> str:
+    """Why a file could not be written, with what to do."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{error.strerror}; the disk is full: free some space, and repeat. Nothing was changed"
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{error.strerror}; make its folder writable for this user"
+    if error.errno in (errno.ENOENT, errno.ENOTDIR):
+        return f"{error.strerror}; does its folder exist?"
+    return f"{error.strerror}; check its folder and its disk"

@@ -135,9 +135,9 @@ def load_saved_robots(path: Path) -> dict[str, Robot]:
     return robots
 
 
-def save_robots(robots: dict[str, Robot], path: Path) -> None:
-    """Write `robots.yaml` atomically; raise ConfigError if the folder is not writable."""
-    write_atomically(path, dump_yaml(_Robots(robots)))
+def save_robots(robots: dict[str, Robot], path: Path, first_line: str = "") -> None:
+    """Write `robots.yaml` atomically, after a comment; raise ConfigError if the folder is not writable."""
+    write_atomically(path, first_line + dump_yaml(_Robots(robots)))
 
 
 def require_trackable(robots: dict[str, Robot], where: str, known: Collection[str] = ()) -> None:

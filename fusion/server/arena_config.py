@@ -19,7 +19,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         zenoh: a Zenoh configuration (JSON5) for TLS, access control or scouting.
         rig: rig.yaml; without one the server waits for a calibration to be published.
         saved_rig: the file that saves a rig that was requested, or corrected after a camera was moved; after a
-            restart the newer of this file and `rig` is used. Nothing is saved unless given.
+            restart it is used unless `rig` was changed since. Nothing is saved unless given.
         robots: robots.yaml.
         saved_robots: the same for robots that were defined, renamed or removed while the server ran.
         cameras: the folder for names and settings of cameras that register; nothing is saved unless given.
@@ -49,6 +49,11 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ValueError(f"rate_hz is {self.rate_hz}; it must be within 0.1 and 1000")
         if not self.listen:
             raise ValueError("listen names no endpoint; give one such as tcp/0.0.0.0:7447")
+
+    def saving_folders(self) -> tuple[Path, ...]:
+        """The folders in which the server writes, each once."""
+        files = (self.saved_rig, self.saved_robots, self.cameras, self.audit)
+        return tuple(sorted({Path(file).resolve().parent for file in files if file}))
 
 
 def load_arena(path: Path) -> ArenaConfig:

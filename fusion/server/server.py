@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from calib.rig.rig_messages import RigMessage
+from camera_node.foundation.folder_lock import locked_folder
 from camera_node.foundation.logs import about
 from camera_node.foundation.service import ServiceManager
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
@@ -68,7 +69,7 @@ class Server:
     Raises, at entry:
         NetworkError: an endpoint is taken.
         ConfigError, FusionError, CalibrationError: a file is missing or broken, or declares robots that can't be
-            tracked.
+            tracked; another server saves in one of the folders.
     """
 
     def __init__(self, config: ArenaConfig, stopped: threading.Event | None = None) -> None:
@@ -77,12 +78,15 @@ class Server:
         self.endpoints = config.listen
         self.shard = Shard.parse(config.shard)
         self.statistics = ServerStatistics(config.limits.lateness_ms)
-        self.pipeline = TrackingPipeline(config, self.shard)
+        with contextlib.ExitStack() as stack:
+            for folder in config.saving_folders() if self.shard.leads else ():
+                stack.enter_context(locked_folder(folder, "server"))
+            self.pipeline = TrackingPipeline(config, self.shard)
+            self._closing = stack.pop_all()
         self._ingest = Ingest(self.keys, self.statistics)
         self._quotas = FrameQuotas(config.limits.lateness_ms, MAX_RATE_HZ)
         self._max_lag_ns = max(MAX_LAG_NS, round(config.limits.lateness_ms * 1e6))
         self._stopped = stopped or threading.Event()
-        self._closing = contextlib.ExitStack()
 
     def __enter__(self) -> "Server":
         with self._closing as stack:

@@ -14,6 +14,7 @@ from typing import Annotated
 import tyro
 
 from camera_node.foundation.errors import TEMPORARY_FAILURE, USER_ERROR, ConfigError
+from camera_node.foundation.folder_lock import locked_folder
 from camera_node.foundation.service import ServiceManager, stopped_by_signals
 from camera_node.foundation.supervisor import Supervisor
 from camera_node.foundation.terminal import say
@@ -66,7 +67,7 @@ class RunArena:
                 "another folder"
             )
         say(f"{'created' if is_new else 'using'} the arena in {self.folder.resolve()}")
-        with stopped_by_signals() as stop:
+        with locked_folder(self.folder, "roundel up"), stopped_by_signals() as stop:
             return ArenaUp(folder, config, stop).run(self)
 
 

@@ -17,15 +17,18 @@ from calib.rig.camera import Camera
 from calib.rig.file_history import History
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from calib.rig.rig_messages import (
+    MARK,
     MAX_CHANGE,
     MAX_VERSIONS,
-    RigChange,
     RigHistory,
     RigMessage,
     RigVersion,
+    SavedChange,
     describe_change,
+    file_digest,
     holds_rig,
     read_change,
+    read_given,
 )
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError, RoundelError
@@ -50,6 +53,7 @@ class ActiveRig:
 
     def __init__(self, given: Path | None, saved: Path | None) -> None:
         self._given, self._saved = given, saved
+        self._digest = file_digest(given)  # in place of which rigs are saved from now on
         self._files: History | None = None
         self._remove_folder: Callable[[], object] = lambda: None
         self.message: RigMessage | None = None
@@ -64,7 +68,7 @@ class ActiveRig:
         return self.message.rig if self.message else None
 
     def load(self, apply: Callable[[Rig], object]) -> None:
-        """Use the newer of the saved and the given rig.
+        """Use the saved rig, or the given one if the user changed it after the other was saved.
 
         A saved rig that is broken, or to which `apply` raises, is logged, and the one before it is used.
 
@@ -79,6 +83,7 @@ class ActiveRig:
                 log.warning("the saved rig %s is not used, but the one before it: %s", path, error)
                 continue
             log.info("using the rig that was last changed over the network: %s", path)
+            self._record_given()
             self.message = RigMessage(t_ns=time.time_ns(), rig=rig, saved=True)
             return
         if self._given is not None:
@@ -105,7 +110,9 @@ class ActiveRig:
             ConfigError, CalibrationError: it can't be saved; the files hold the rig in use.
         """
         text = describe_change(self.rig, rig)[:MAX_CHANGE]
-        change = RigChange(t_ns=now_ns, change=text, source=source, is_correction=is_correction).line()
+        change = SavedChange(
+            t_ns=now_ns, change=text, source=source, is_correction=is_correction, given=self._digest
+        ).line()
         path = self._history.path
         if not holds_rig(path, rig) or not self._is_in_history():
             self._save_active()
@@ -223,16 +230,31 @@ class ActiveRig:
     def undo(self) -> None:
         """Restore the file of the previous rig; raises as `previous`."""
         self._history.undo()
+        self._record_given()
 
     def redo(self) -> None:
         """Restore the file of the rig that was undone last; raises as `previous`."""
         self._history.redo()
+        self._record_given()
+
+    def _record_given(self) -> None:
+        """Let the saved file say in place of which file it is used: a version of the history has another one."""
+        path = self._saved
+        if path is None or not path.exists() or read_given(path) == self._digest or not self._digest:
+            return
+        with contextlib.suppress(RoundelError, OSError):  # a folder that can't be written to: as it was
+            change = msgspec.structs.asdict(read_change(path))
+            text = path.read_text(encoding="utf-8")
+            body = text.partition("\n")[2] if text.startswith(MARK) else text
+            write_atomically(path, SavedChange(**change, given=self._digest).line() + body)
 
     def _save_active(self) -> None:
         """Save the rig in use unless the saved file holds it: a rig of the configuration, or one that is newer."""
         if self.message is not None and not holds_rig(self._history.path, self.message.rig):
             rig, t_ns = self.message.rig, self.message.t_ns
-            change = RigChange(t_ns=t_ns, change=describe_change(None, rig), source=self.message.source)
+            change = SavedChange(
+                t_ns=t_ns, change=describe_change(None, rig), source=self.message.source, given=self._digest
+            )
             save_rig(rig, self._history.path, change.line())
 
     @property
@@ -248,11 +270,10 @@ class ActiveRig:
         return Path(folder)
 
     def _saved_rigs(self) -> Iterator[Path]:
-        """The saved rig and those before it, newest first; none if the user's file is newer."""
-        if self._saved is None or not self._saved.exists():
+        """The saved rig and those before it, newest first; none if the user changed the given file since then."""
+        if self._saved is None or not self._saved.exists() or self._saved == self._given:
             return
-        if is_newer(self._given, self._saved):
-            log.info("using %s, which is newer than %s", self._given, self._saved)
+        if was_changed_since(self._given, self._saved):
             return
         yield self._saved
         yield from reversed(self._history.older())
@@ -271,9 +292,21 @@ def _rename_in_file(path: Path, before: str, after: str) -> None:
     """Raises ConfigError or CalibrationError for a file that can't be read or written."""
     rig, change = load_rig(path), read_change(path)
     if before in rig.cameras:
-        write_atomically(path, change.line() + dump_rig(renamed(rig, before, after)))
+        line = SavedChange(**msgspec.structs.asdict(change), given=read_given(path) or "").line()
+        write_atomically(path, line + dump_rig(renamed(rig, before, after)))
 
 
-def is_newer(given: Path | None, saved: Path) -> bool:
-    """Whether the user wrote the file `given` after the server wrote the file `saved`."""
-    return given is not None and given.exists() and given.stat().st_mtime >= saved.stat().st_mtime
+def was_changed_since(given: Path | None, saved: Path) -> bool:
+    """Whether the user changed the file `given` after the server wrote `saved`, which is logged.
+
+    The saved file names the content that it replaces. Times of files don't decide: copies and clones have others.
+    """
+    digest, replaced = file_digest(given), read_given(saved)
+    if replaced is None and digest:
+        text = "using %s and not %s: no version says which one is newer. To use the other one, move %s away"
+        log.warning(text, saved, given, saved)
+        return False
+    if replaced == digest or not digest:
+        return False
+    log.warning("using %s, which was changed after the server wrote %s; that one is kept", given, saved)
+    return True

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A rig is backed up before it is replaced; undo and redo step through the versions, and none is lost."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -87,18 +86,6 @@ def test_undo_restores_a_deleted_rig(tmp_path: Path):
     path.unlink()
     assert History(path).undo().replaced is None
     assert number_of(path) == 0
-
-
-def test_a_restored_rig_is_newer_than_other_files(tmp_path: Path):
-    """The server uses the newer one of two files."""
-    path = tmp_path / "rig.yaml"
-    for k in range(2):
-        save_rig(numbered(k), path)
-    for file in tmp_path.iterdir():
-        os.utime(file, (0, 0))
-    (tmp_path / "other").write_text("")
-    History(path).undo()
-    assert path.stat().st_mtime >= (tmp_path / "other").stat().st_mtime
 
 
 def test_other_files_in_the_folder_are_ignored(tmp_path: Path):

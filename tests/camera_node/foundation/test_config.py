@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """YAML files: an error names the file and the place in it."""
 
+import errno
+import os
 import stat
 from pathlib import Path
 
@@ -8,7 +10,7 @@ import msgspec
 import pytest
 
 from camera_node.foundation.config import load_yaml, write_atomically
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, describe_failed_write
 from camera_node.geometry.body import Body
 
 
@@ -70,3 +72,18 @@ def test_an_error_names_the_entry_of_a_mapping(tmp_path: Path):
 
 class _Robots(msgspec.Struct):
     robots: dict[str, Body]
+
+
+@pytest.mark.parametrize(
+    ("number", "says"),
+    [
+        (errno.ENOSPC, "the disk is full: free some space"),
+        (errno.EDQUOT, "the disk is full: free some space"),
+        (errno.EACCES, "make its folder writable"),
+        (errno.ENOENT, "does its folder exist?"),
+    ],
+)
+def test_a_failed_write_says_what_happened(number: int, says: str):
+    text = describe_failed_write(OSError(number, os.strerror(number)))
+    assert text.startswith(os.strerror(number))
+    assert says in text

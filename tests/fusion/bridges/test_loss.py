@@ -11,6 +11,7 @@ from camera_node.protocol.session import open_client
 from fusion.bridges.pose_queue import PoseQueue
 from fusion.client.arena import Arena
 from fusion.protocol.pose_messages import RobotPose
+from tests.fusion.bridges.autopilot import Autopilot
 from tests.fusion.bridges.foxglove_reader import FoxgloveClient
 from tests.fusion.bridges.pose_server import (
     ARENA,
@@ -20,8 +21,7 @@ from tests.fusion.bridges.pose_server import (
     publish_poses,
     server_process,
 )
-from tests.fusion.bridges.test_mavlink import Autopilot
-from tests.fusion.bridges.test_vrpn import VrpnReader, serving
+from tests.fusion.bridges.vrpn_reader import VrpnReader, serving
 from tests.processes import first_line
 from tests.waiting import wait_for
 

@@ -6,17 +6,16 @@ import time
 import msgspec
 import numpy as np
 import pytest
-from pymavlink import mavutil
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz, wxyz_from_rotation
 from fusion.bridges.mavlink_frames import FrdFrames, roll_pitch_yaw
 from fusion.bridges.mavlink_vehicle import MavlinkVehicle, RateDivider, ResetCounter
 from fusion.protocol.pose_messages import FusionStatus
-from tests.conftest import free_port
+from tests.fusion.bridges.autopilot import Autopilot
 from tests.fusion.bridges.pose_server import PoseServer, bridge, moving_pose, restart
 from tests.missing_package import advice_without
-from tests.waiting import DEADLINE_S, wait_for
+from tests.waiting import wait_for
 
 ORIGIN, HEADING_DEG, FORWARD_DEG = (1.0, -2.0, 0.5), 30.0, 100.0
 OPTIONS = ("--origin-m", "1", "-2", "0.5", "--heading-deg", "30", "--forward-deg", "100")
@@ -27,26 +26,6 @@ def axes(degrees: float) -> np.ndarray:
     """(3, 3) rows: forward, right and down of a frame whose forward direction is so far from x towards y."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, s, 0], [s, -c, 0], [0, 0, -1]])
-
-
-class Autopilot:
-    """pymavlink's end of the connection; its own clock starts at 0, as that of PX4."""
-
-    def __init__(self) -> None:
-        self.port = free_port()
-        self.link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{self.port}", dialect="common")
-        self.begun_ns = time.monotonic_ns()
-
-    def __enter__(self) -> "Autopilot":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.link.close()
-
-    def receive(self, kind: str):
-        message = self.link.recv_match(type=kind, blocking=True, timeout=DEADLINE_S)
-        assert message is not None, f"no {kind}"
-        return message
 
 
 def test_odometry_is_the_pose_in_frd_frames_with_its_time_velocity_and_covariance(endpoint: str):

@@ -3,6 +3,7 @@
 
 import json
 import os
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -146,7 +147,7 @@ def test_the_key_for_reading_robots_changes_none(tmp_path):
 
 
 def test_changed_robots_are_used_after_a_restart(tmp_path):
-    """Even if no robot is left; but a file that the user wrote later has precedence."""
+    """Even if no robot is left; but a file that the user changed later has precedence, and the other one is kept."""
     settings = msgspec.structs.replace(config(tmp_path), saved_robots=str(tmp_path / "robots.saved.yaml"))
     requests = (RobotsRequest(define={"wide": WIDE}, rename={"a": "b"}), RobotsRequest(remove=("b", "wide")))
     before = {"a"}
@@ -160,10 +161,41 @@ def test_changed_robots_are_used_after_a_restart(tmp_path):
         before = after
     with serving(settings) as (server, _):
         assert not server.pipeline.robots
-    later = (tmp_path / "robots.saved.yaml").stat().st_mtime_ns + 10**9
-    os.utime(settings.robots, ns=(later, later))
+    given, saved = Path(settings.robots), tmp_path / "robots.saved.yaml"
+    os.utime(given, (4e9, 4e9))  # as by a copy
     with serving(settings) as (server, _):
+        assert not server.pipeline.robots
+    given.write_text(f"{given.read_text()}# edited\n")
+    os.utime(given, (0, 0))
+    old = saved.read_text()
+    with serving(settings) as (server, client):
         assert set(server.pipeline.robots) == {"a"}
+        request_reply(client, set_robots_key("test"), encode(RobotsRequest(define={"wide": WIDE})))
+    assert (tmp_path / "robots.saved.1.yaml").read_text() == old
+    with serving(settings) as (server, _):
+        assert set(server.pipeline.robots) == {"a", "wide"}
+
+
+def test_what_a_user_edits_while_the_server_runs_is_not_overwritten(tmp_path):
+    """The change over the network comes on top of the edit, or is refused while the file is broken."""
+    path = tmp_path / "one.yaml"
+    settings = msgspec.structs.replace(config(tmp_path), robots=str(path), saved_robots=str(path))
+    key = set_robots_key("test")
+    with serving(settings) as (server, client):
+        for name in ("wide", "other"):
+            robot = msgspec.structs.replace(WIDE, start_m=(float(name == "wide"), 0.0, 0.0))
+            request_reply(client, key, encode(RobotsRequest(define={name: robot})))
+        path.write_text(path.read_text().replace("wide:", "edited:"))
+        reply, _ = request_reply(client, key, encode(RobotsRequest(rename={"other": "third"})))
+        assert set(robots_of(reply).robots) == set(server.pipeline.robots) == {"edited", "third"}
+        assert set(load_robots(path)) == {"edited", "third"}
+        broken = path.read_text() + "robots: {"
+        path.write_text(broken)
+        reply, error = request_reply(client, key, encode(RobotsRequest(remove=("third",))))
+        assert reply is None
+        assert f"{path} was edited while the server runs, and can't be used" in error
+        assert path.read_text() == broken
+        assert set(server.pipeline.robots) == {"edited", "third"}
 
 
 def test_one_file_of_robots_for_the_user_and_the_server(tmp_path):

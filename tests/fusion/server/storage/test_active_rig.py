@@ -14,7 +14,7 @@ import pytest
 from calib.live.rig_requests import set_rig
 from calib.rig.file_history import MAX_OLD, History
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
-from calib.rig.rig_messages import RigHistory
+from calib.rig.rig_messages import RigHistory, SavedChange
 from camera_node.foundation.errors import NetworkError
 from camera_node.geometry.pose import Pose
 from camera_node.protocol.camera_requests import change_camera
@@ -265,21 +265,53 @@ def test_corrections_of_moved_cameras_displace_no_calibration(tmp_path: Path):
     assert makers == ["the server or a file"] * 3 + ["the server"] * (MAX_OLD - 2)
 
 
-def test_the_newer_of_the_given_and_the_saved_rig_is_used(tmp_path: Path):
+def test_content_decides_which_rig_is_used_and_no_time_of_a_file(tmp_path: Path):
+    """Copies, clones and clocks change the times of files. A given rig that the user edited later has precedence."""
+    settings = saving(tmp_path)
+    given, saved = tmp_path / "rig.yaml", tmp_path / "rig.saved.yaml"
+    with serving(settings) as (_, client):
+        client.set_rig(FEWER)
+    for at in (0, 4 * 10**9):
+        os.utime(given, (at, at))
+        assert loaded(given, saved) == FEWER
+    original = given.read_text()
+    given.write_text(dump_rig(numbered(3)))
+    os.utime(given, (0, 0))
+    assert loaded(given, saved) == numbered(3)
+    given.write_text(original)
+    assert loaded(given, saved) == FEWER
+
+
+def test_an_undone_rig_stays_in_force_although_it_was_saved_in_place_of_another_file(tmp_path: Path):
+    settings = saving(tmp_path)
+    with serving(settings) as (_, client):
+        client.set_rig(FEWER)
+    (tmp_path / "rig.yaml").write_text(dump_rig(numbered(3)))
+    with serving(settings) as (_, client):
+        assert client.rig(DEADLINE_S) == numbered(3)
+        assert client.undo_rig().rig == FEWER
+    with serving(settings) as (_, client):
+        assert client.rig(DEADLINE_S) == FEWER
+
+
+def test_a_saved_rig_of_an_older_version_is_used_until_the_given_one_is_edited(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    """Its file does not say in place of which content it is used: both are named, and from then on it does."""
     given, saved = tmp_path / "rig.yaml", tmp_path / "rig.saved.yaml"
     config(tmp_path)  # writes rig.yaml
     saved.write_text(dump_rig(FEWER))
-    for age_ns, expected in ((-1, FEWER), (1, GIVEN)):
-        at = saved.stat().st_mtime_ns + age_ns * 10**9
-        os.utime(given, ns=(at, at))
-        assert loaded(given, saved) == expected
+    with caplog.at_level(logging.WARNING, "fusion"):
+        assert loaded(given, saved) == FEWER
+    assert f"using {saved} and not {given}" in caplog.text
+    given.write_text(dump_rig(numbered(3)))
+    assert loaded(given, saved) == numbered(3)
 
 
-def test_undo_restores_the_saved_rig_that_a_newer_file_replaced(tmp_path: Path):
+def test_undo_restores_the_saved_rig_that_an_edited_file_replaced(tmp_path: Path):
     settings = saving(tmp_path)
-    Path(settings.saved_rig or "").write_text(dump_rig(FEWER))
-    later = (tmp_path / "rig.saved.yaml").stat().st_mtime_ns + 10**9
-    os.utime(tmp_path / "rig.yaml", ns=(later, later))
+    of_another = SavedChange(t_ns=0, given="0" * 32).line()
+    (tmp_path / "rig.saved.yaml").write_text(of_another + dump_rig(FEWER))
     with serving(settings) as (_, client):
         assert client.rig(DEADLINE_S) == GIVEN
         assert client.undo_rig().rig == FEWER
