@@ -12,6 +12,7 @@ import logging
 import os
 import secrets
 import socket
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ Handler = Callable[[ServerConnection, Request], Response | None]
 
 MAX_MESSAGE = 1 << 16  # bytes from a browser; the longest are clicks and typed names
 MIN_TOKEN = 16  # characters
+MAX_CONNECTIONS = 768  # of 1,024 files that a process may open by default; the page needs some hundred itself
+MAX_OF_ADDRESS = 256  # connections of one machine or proxy; a browser has one, and six while it loads
 VIEWER_MESSAGES = frozenset({"ViewerCameraMessage"})  # the viewpoint of the browser itself
 OPERATOR_MESSAGES = VIEWER_MESSAGES | {"GuiUpdateMessage", "ScenePointerMessage"}
 HEADERS = {  # of each file: no other site may show the page in a frame, or learn its address
@@ -254,8 +257,48 @@ def is_allowed(data: Data, role: Role) -> bool:
     return message.type in messages and set(message.updates) <= {"value"}
 
 
+class OpenConnections:
+    """How many connections are open, of each address and of all; those beyond the limits are ended at once.
+
+    A process has 1,024 files unless its service permits more: without a limit, one machine takes all of them.
+    """
+
+    def __init__(self) -> None:
+        self._of_address: Counter[str] = Counter()
+
+    def admit(self, address: str) -> bool:
+        """Count a connection, and return whether it is within the limits."""
+        self._of_address[address] += 1
+        is_within = (
+            self._of_address[address] <= MAX_OF_ADDRESS and self._of_address.total() <= MAX_CONNECTIONS
+        )
+        if not is_within:
+            log.warning("refused a browser at %s: %d connections are open", address, self._of_address.total())
+        return is_within
+
+    def remove(self, address: str) -> None:
+        """A connection ended."""
+        self._of_address[address] -= 1
+        if not self._of_address[address]:
+            del self._of_address[address]
+
+
 class GuardedConnection(ServerConnection):
-    """A browser's connection that drops the messages that its role may not send."""
+    """A browser's connection that drops the messages that its role may not send, and ends if too many are open."""
+
+    open_connections: OpenConnections
+    _counted_address: str | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self._counted_address = _address(self)
+        if not self.open_connections.admit(self._counted_address):
+            transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._counted_address is not None:
+            self.open_connections.remove(self._counted_address)
+        super().connection_lost(exc)
 
     async def recv(self, decode: bool | None = None) -> Any:
         while True:
@@ -281,7 +324,8 @@ def guarding(access: PageAccess) -> Iterator[None]:
         def answer(connection: ServerConnection, request: Request) -> Response | None:
             return access.answer(connection, request, process_request)
 
-        options |= {"create_connection": GuardedConnection, "max_size": MAX_MESSAGE}
+        kind = type("PageConnection", (GuardedConnection,), {"open_connections": OpenConnections()})
+        options |= {"create_connection": kind, "max_size": MAX_MESSAGE}
         return serve(*arguments, process_request=answer, **options)
 
     websockets.asyncio.server.serve = serve_guarded  # pyright: ignore[reportAttributeAccessIssue]

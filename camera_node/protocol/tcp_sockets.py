@@ -6,6 +6,7 @@ import os
 import socket
 import stat
 import struct
+from collections import Counter
 from collections.abc import Iterator
 
 DESCRIPTORS = "/dev/fd"  # of this process; on Linux /proc/self/fd
@@ -16,7 +17,7 @@ NO_LINGER = struct.pack("ii", 0, 0)
 def tcp_sockets() -> Iterator[socket.socket]:
     """A copy of each TCP socket, open until the next one: both have the same options."""
     try:
-        descriptors = [int(name) for name in os.listdir(DESCRIPTORS)]
+        descriptors = sorted(int(name) for name in os.listdir(DESCRIPTORS))
     except OSError:  # a container without /proc
         return
     for descriptor in descriptors:
@@ -40,6 +41,30 @@ def stop_lingering() -> int:
                 copy.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, NO_LINGER)
                 changed += 1
     return changed
+
+
+def close_excess(limit: int) -> dict[str, int]:
+    """End the newest of the connections that an address has beyond `limit` to this process's listeners.
+
+    The newest have the highest descriptors, unless older ones were closed before: then some other is ended, which
+    connects again if its program lives.
+
+    Returns:
+        how many were ended, by address.
+    """
+    ports, n_open, closed = set[int](), Counter[str](), Counter[str]()
+    for copy in tcp_sockets():
+        if copy.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+            ports.add(copy.getsockname()[1])
+    for copy in tcp_sockets():
+        with contextlib.suppress(OSError):  # a listener, or a connection that was reset
+            if copy.getsockname()[1] in ports:
+                address = copy.getpeername()[0]
+                n_open[address] += 1
+                if n_open[address] > limit:
+                    copy.shutdown(socket.SHUT_RDWR)
+                    closed[address] += 1
+    return dict(closed)
 
 
 def _copy(descriptor: int) -> socket.socket | None:

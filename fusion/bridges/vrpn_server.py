@@ -23,6 +23,8 @@ from fusion.protocol.pose_messages import RobotPose
 log = logging.getLogger("fusion.vrpn")
 
 MAX_CLIENTS = 64
+MAX_OF_ADDRESS = 16  # clients of one machine, which keep out no other one
+STALL_S = 10.0  # for which a client may take nothing of what waits for it
 HANDSHAKE_S = 5.0
 BACKLOG = 1 << 18  # bytes that wait for a slow client, which then misses poses
 DATAGRAM = 1400  # bytes, below the payload of an Ethernet frame
@@ -35,6 +37,7 @@ class VrpnClient:
 
     Args:
         connection: a TCP socket, maybe not yet connected.
+        host: the client's address.
         datagrams: the socket from which UDP is sent.
         describe: the descriptions of all our types and senders.
         sender_of: our number of a sender by its name, or None.
@@ -43,19 +46,26 @@ class VrpnClient:
     def __init__(
         self,
         connection: socket.socket,
+        host: str,
         datagrams: socket.socket,
         describe: Callable[[], bytes],
         sender_of: Callable[[str], int | None],
     ) -> None:
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.connection, self.dropped = connection, 0
+        self.connection, self.host, self.dropped = connection, host, 0
         self.is_ready = False  # the client's cookie was right
-        self.begun_s = time.monotonic()
+        self.begun_s = self._taken_s = time.monotonic()
         self._datagrams, self._describe, self._sender_of = datagrams, describe, sender_of
         self._received, self._unsent = bytearray(), bytearray(vrpn.COOKIE)
         self._names: dict[tuple[int, int], str] = {}  # (kind of description, the client's number) -> name
         self._udp: tuple[str, int] | None = None
+
+    @property
+    def is_stalled(self) -> bool:
+        """Whether it takes nothing, or what waits for it has no bound: pongs and names are sent besides poses."""
+        is_silent = bool(self._unsent) and time.monotonic() - self._taken_s > STALL_S
+        return is_silent or len(self._unsent) > 2 * BACKLOG
 
     @property
     def events(self) -> int:
@@ -68,10 +78,13 @@ class VrpnClient:
         Raises:
             OSError: the connection ended.
         """
+        if not self._unsent:
+            self._taken_s = time.monotonic()
         self._unsent += data
         with contextlib.suppress(BlockingIOError):
             while self._unsent:
                 del self._unsent[: self.connection.send(self._unsent)]
+                self._taken_s = time.monotonic()
 
     def report(self, poses: list[bytes]) -> None:
         """Send poses, by UDP if the client listens there; a client that is too slow misses them.
@@ -174,6 +187,8 @@ class VrpnServer:
         for client in tuple(self._clients):
             if not client.is_ready and time.monotonic() - client.begun_s > HANDSHAKE_S:
                 self._drop(client, "clients that sent no cookie")
+            elif client.is_stalled:
+                self._drop(client, "clients that did not read")
 
     def publish(self, poses: list[RobotPose]) -> None:
         """Report the poses of robots that are not lost to all clients, and by a text which ones became lost."""
@@ -215,7 +230,8 @@ class VrpnServer:
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):  # the client is gone already
-            self._add(self._listener.accept()[0])
+            connection, (host, _) = self._listener.accept()
+            self._add(connection, host)
 
     def _call(self) -> None:
         """Connect to a client that asked for it by a datagram; only to the address that the datagram came from."""
@@ -228,14 +244,19 @@ class VrpnServer:
             connection = socket.socket()
             connection.setblocking(False)
             connection.connect_ex((host, int(match[1])))
-            self._add(connection)
+            self._add(connection, host)
 
-    def _add(self, connection: socket.socket) -> None:
-        if len(self._clients) >= MAX_CLIENTS:
-            self.faults[f"clients beyond {MAX_CLIENTS}"] += 1
-            connection.close()
-            return
-        client = VrpnClient(connection, self._datagrams, self._describe, self._senders.get)
+    def _add(self, connection: socket.socket, host: str) -> None:
+        n_of_host = sum(client.host == host for client in self._clients)
+        for n, limit, whose in (
+            (len(self._clients), MAX_CLIENTS, ""),
+            (n_of_host, MAX_OF_ADDRESS, f" of {host}"),
+        ):
+            if n >= limit:
+                self.faults[f"clients beyond {limit}{whose}"] += 1
+                connection.close()
+                return
+        client = VrpnClient(connection, host, self._datagrams, self._describe, self._senders.get)
         self._clients.append(client)
         self._selector.register(connection, client.events, client)
 

@@ -38,6 +38,10 @@ PLANAR_M = 0.005  # markers within this of a plane show the robot's z axis bette
 SIDES_RAD = math.radians(45)  # between normals of different sides; several sigma of a measured one
 OFF_CENTRE_M = 0.02  # the first marker this far from the centre defines the x axis
 Rows = tuple[tuple[float, float, float], ...]
+LONE = (
+    "nothing but its size identifies a robot of one roundel: any other roundel of that size, or its image in a mirror, "
+    "can be taken for it; remove or cover those, or use three roundels"
+)
 LOST_AT_RESTART = "a restart of the server loses it, because arena.yaml names no saved_robots"
 
 
@@ -290,5 +294,7 @@ def describe(name: str, robots: Robots) -> str:
     pairs = ", ".join(f"{i}-{j} {D[i, j] * 1e3:.1f}" for i, j in combinations(range(len(D)), 2))
     defined = f"the server now tracks {name}, with {len(D)} marker{'s' * (len(D) > 1)}"
     entry = msgspec.json.encode({name: robot}).decode()[1:-1].replace('":', '": ').replace(",", ", ")
-    lost = f"; {LOST_AT_RESTART}" if name in robots.unsaved else ""
-    return f"{defined}{f' (distances in mm: {pairs})' if pairs else ''}{lost}; for robots.yaml:\n  {entry}"
+    notes = (f"; {LOST_AT_RESTART}" if name in robots.unsaved else "") + (
+        f"; {LONE}" if robot.is_single else ""
+    )
+    return f"{defined}{f' (distances in mm: {pairs})' if pairs else ''}{notes}; for robots.yaml:\n  {entry}"

@@ -19,7 +19,7 @@ from camera_node.foundation.logs import about
 from camera_node.foundation.service import ServiceManager
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.session import listening_endpoints
-from camera_node.protocol.tcp_sockets import stop_lingering
+from camera_node.protocol.tcp_sockets import close_excess, stop_lingering
 from fusion.errors import FusionError
 from fusion.model.frames import FrameSet
 from fusion.model.undistortion import prepare_lenses
@@ -53,6 +53,9 @@ from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
 TICK_S = 0.005  # resolution at which a wait for frames ends
+MAX_OF_ADDRESS = (
+    250  # connections: a quarter of Zenoh's sessions, and more than the cameras and programs of a machine
+)
 MAX_LAG_NS = 500_000_000  # of the server; it drops the frames that it can't process within this
 
 
@@ -125,6 +128,7 @@ class Server:
                     if status := self._report_status(now_ns):
                         service.report(describe_status(status))
                         stop_lingering()  # of connections that are new since the last status
+                        self._limit_connections()
                         collect_garbage()
                 service.progress()
 
@@ -140,13 +144,32 @@ class Server:
         queries.declare(audit)
         if self.shard.leads:
             queries.declare_rig(audit)
-            registry = CameraRegistry(Path(self.config.cameras) if self.config.cameras else None)
+            registry = CameraRegistry(
+                Path(self.config.cameras) if self.config.cameras else None, self._is_used
+            )
             retire = self.statistics.retire
             CameraQueries(keys, registry, self.pipeline, transport, self.clock, retire).declare(audit)
             transport.declare_alive(keys.fusion_alive)
         else:
             transport.subscribe(keys.rig, self._follow_rig, _prepare_lenses)
             transport.subscribe(keys.fusion_status, self._request_new_rig)
+
+    def _limit_connections(self) -> None:
+        """End connections of an address that has too many: Zenoh limits all sessions together."""
+        for address, count in close_excess(MAX_OF_ADDRESS).items():
+            for _ in range(count):
+                self.statistics.count_fault("connections beyond the limit of one address")
+            log.warning(
+                "ended %d connections of %s: more than %d",
+                count,
+                address,
+                MAX_OF_ADDRESS,
+                extra=about(address),
+            )
+
+    def _is_used(self, camera: str) -> bool:
+        rig = self.pipeline.active_rig.rig
+        return self.statistics.sends_frames(camera) or (rig is not None and camera in rig.cameras)
 
     @contextlib.contextmanager
     def _guarded(self, stage: str) -> Iterator[None]:

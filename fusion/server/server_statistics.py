@@ -138,6 +138,10 @@ class ServerStatistics:
         camera.is_gone, camera.last_ns, camera.taken_ns = False, received_ns, t_ns
         camera.lateness_ms.append((received_ns - t_ns) * 1e-6)
 
+    def sends_frames(self, name: str) -> bool:
+        """Whether the camera sent a frame since the server started, and was not retired since then."""
+        return name in self._cameras and not self._cameras[name].is_retired
+
     def retire(self, name: str, is_retired: bool = True) -> None:
         """List a camera no more, which has another name or was forgotten; or again, because a camera has this name."""
         if name in self._cameras:

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The page's tokens, origins and roles, with raw WebSocket clients, HTTP requests and a browser."""
 
+import contextlib
 import http.client
 import re
+import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count
@@ -21,7 +23,7 @@ from camera_node.foundation.errors import ConfigError
 from tests.conftest import free_port
 from tests.waiting import DEADLINE_S, Inbox, wait_for
 from tests.web.browser import browsing, drawing
-from web.page_access import MAX_MESSAGE, PageAccess, Tokens, is_loopback
+from web.page_access import MAX_MESSAGE, MAX_OF_ADDRESS, PageAccess, Tokens, is_loopback
 from web.state.feed import Feed
 from web.view import READ_ONLY, View
 
@@ -298,3 +300,14 @@ def test_a_browser_of_each_role(closing: ExitStack):
         assert page.clicks.until(lambda items: items)
         assert browser.get_by_text(READ_ONLY[2:11]).count() == 0
     assert page.clicks.items == ["click"], "the operator's"
+
+
+def test_one_address_keeps_no_other_one_out(local: Page, closing: ExitStack):
+    """Its connections beyond the limit are ended at once, also those that never ask for anything."""
+    address = ("127.0.0.1", local.access.port)
+    for _ in range(MAX_OF_ADDRESS):
+        closing.enter_context(socket.create_connection(address, DEADLINE_S, ("127.0.0.2", 0)))
+    excess = closing.enter_context(socket.create_connection(address, DEADLINE_S, ("127.0.0.2", 0)))
+    with contextlib.suppress(ConnectionResetError):
+        assert excess.recv(1) == b""
+    assert local.get().status == 200

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import require_name
 from fusion.client.robot_definition import (
+    LONE,
     StationaryMarkers,
     describe,
     find_stationary_markers,
@@ -49,7 +50,7 @@ class MarkerPicker:
                 "Define robot",
                 self.define,
                 self._answer,
-                "measures the selected markers for 1.5 s",
+                f"measures the selected markers for 1.5 s; {LONE}",
             )
             self._everything = ActionButton(
                 server.gui,

@@ -5,6 +5,7 @@ The files are read again when they change, so that an editor and the network cha
 """
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +44,15 @@ class CameraRegistry:
 
     Args:
         folder: of the files, created with the first camera; None to store nothing beyond the end of the program.
+        is_used: whether a camera, by its name, sends frames or is in the rig. Where the list is full, a camera that is
+            not used and has no settings is forgotten for a new one, the one that registered first.
     """
 
-    def __init__(self, folder: Path | None) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path | None, is_used: Callable[[str], bool] = lambda name: True) -> None:
+        self._folder, self._is_used = folder, is_used
+        self._registered: dict[
+            str, None
+        ] = {}  # the cameras that registered since the start, the last one last
         self._cameras: dict[str, RegisteredCamera] = {}
         self._read_at: dict[str, int] = {}  # modification time of each file, ns
 
@@ -65,7 +71,7 @@ class CameraRegistry:
         """
         cameras = self.cameras()
         name = next((name for name, camera in cameras.items() if camera.id == request.id), "")
-        if not name and len(cameras) >= MAX_CAMERAS:
+        if not name and len(cameras) >= MAX_CAMERAS and not self._forget_unused(cameras):
             raise RequestError(
                 f"{MAX_CAMERAS} cameras are registered; forget one that is no longer used (roundel cameras forget)"
             )
@@ -79,10 +85,26 @@ class CameraRegistry:
             settings=settings,
         )
         if not name:
+            cameras = self.cameras()
             name = request.name if request.name and request.name not in cameras else _free_name(cameras)
+        self._registered.pop(name, None)
+        self._registered[name] = None
         if camera != cameras.get(name):
             self._write(name, camera)
         return name
+
+    def _forget_unused(self, cameras: dict[str, RegisteredCamera]) -> bool:
+        """Forget a camera that only registered, if there is one; those of an earlier start first."""
+        order = {name: k for k, name in enumerate(self._registered)}
+        unused = [
+            n for n, camera in cameras.items() if camera.settings == Settings() and not self._is_used(n)
+        ]
+        if not unused:
+            return False
+        name = min(unused, key=lambda name: order.get(name, -1))
+        log.warning("camera %s, which sends no frames, is forgotten: %d are registered", name, len(cameras))
+        self._remove(name)
+        return True
 
     def find(self, camera: str) -> str:
         """The name of a camera that is given by its name or id; raises RequestError if there is none."""
@@ -159,6 +181,7 @@ class CameraRegistry:
         if self._folder is not None:
             (self._folder / f"{name}.yaml").unlink(missing_ok=True)
             self._read_at.pop(name, None)
+        self._registered.pop(name, None)
         self._cameras.pop(name, None)
 
 

@@ -17,11 +17,12 @@ import pytest
 
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from fusion.bridges.vrpn_messages import VELOCITY_S, turn
+from fusion.bridges.vrpn_server import MAX_OF_ADDRESS
 from tests.conftest import ROOT
 from tests.fusion.bridges.pose_server import PoseServer, restart
 from tests.fusion.bridges.vrpn_reader import VrpnReader, serving
 from tests.processes import killed_at_end, run_program
-from tests.waiting import DEADLINE_S
+from tests.waiting import DEADLINE_S, wait_for
 
 FLOAT32 = 1e-6  # relative; libmotioncapture converts to float32, whose steps are 1.2e-7
 MICROSECOND_NS = 1000
@@ -147,3 +148,38 @@ def test_a_turn_is_a_unit_quaternion_at_any_speed():
     for speed in (0.0, 1e-12, 1.0, np.pi / VELOCITY_S, 1e5):
         assert np.linalg.norm(turn((speed, 0.0, 0.0))) == pytest.approx(1.0, abs=1e-12)
     assert turn((0.0, 0.0, 0.0)) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_a_client_that_never_reads_is_dropped(endpoint: str):
+    """What waits for it is bounded, also the answers to its pings, and others are served."""
+    with (
+        PoseServer(endpoint),
+        serving(endpoint) as port,
+        VrpnReader(port) as deaf,
+        VrpnReader(port) as reader,
+    ):
+        for kind, number, name in ((-1, 7, b"drone\0"), (-2, 5, b"vrpn_Base ping_message\0")):
+            deaf.send(kind, number, struct.pack(">i", len(name)) + name)
+        deaf.connection.settimeout(DEADLINE_S)
+
+        def ping() -> bool:
+            with contextlib.suppress(ConnectionError):
+                for _ in range(1000):
+                    deaf.send(5, 7, b"")
+                return False
+            return True
+
+        wait_for(ping)
+        assert reader.next()[0] in ("rover", "drone")
+
+
+def test_one_machine_has_a_bounded_number_of_clients(endpoint: str):
+    with PoseServer(endpoint), serving(endpoint) as port, contextlib.ExitStack() as stack:
+        for _ in range(MAX_OF_ADDRESS):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port), DEADLINE_S, ("127.0.0.2", 0)))
+        excess = stack.enter_context(
+            socket.create_connection(("127.0.0.1", port), DEADLINE_S, ("127.0.0.2", 0))
+        )
+        with contextlib.suppress(ConnectionResetError):
+            assert excess.recv(1) == b""
+        assert stack.enter_context(VrpnReader(port)).next()[0] in ("rover", "drone")

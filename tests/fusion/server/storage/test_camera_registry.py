@@ -100,3 +100,19 @@ def test_the_number_of_cameras_is_bounded():
     with pytest.raises(RequestError, match=f"{MAX_CAMERAS} cameras"):
         registry.register(request("another"))
     assert registry.register(request("id0")) == "camera-1"
+
+
+def test_registrations_alone_do_not_keep_a_camera_out(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """A camera that only registered is forgotten for a new one; those that are used or have settings stay."""
+    registry = CameraRegistry(tmp_path, {"camera-1"}.__contains__)
+    for k in range(MAX_CAMERAS):
+        registry.register(request(f"id{k}"))
+    registry.change("camera-2", CameraChange(camera="camera-2", settings=Settings(gain=2.0)))
+    names = [registry.register(request(f"new{k}")) for k in range(2 * MAX_CAMERAS)]
+    assert not {"camera-1", "camera-2"} & set(names)
+    assert len(registry.cameras()) == MAX_CAMERAS
+    assert {"id0", "id1", f"new{2 * MAX_CAMERAS - 1}"} <= {
+        camera.id for camera in registry.cameras().values()
+    }
+    assert "camera-3, which sends no frames, is forgotten" in caplog.text
+    assert registry.cameras() == CameraRegistry(tmp_path).cameras()
