@@ -2,6 +2,8 @@
 """`roundel verify`: scale and precision of a calibration, by an object of known size that was not used for it."""
 
 import json as json_format
+import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +38,7 @@ from fusion.recordings.offline_fusion import (
 HOLDS, DIFFERS = 0, 1  # exit codes; 2 for mistakes, and where the object was not seen
 MAX_SECONDS = 600.0
 ANSWER_S = 5.0
+WAIT_S = 0.2  # between two looks at what has arrived
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,19 +124,20 @@ class Verify:
         with Arena(self.connection.wait(), self.connection.arena) as client:
             cameras = self._placed_cameras(client)
             verifier = Verifier(body, cameras, 1e-3 * self.length_sigma_mm)
-            messages: list[Markers] = []
+            messages: deque[Markers] = deque()
             with stopped_by_signals() as stop:
                 remove = client.markers().on_message(messages.append)
                 if not self.json:
                     say(
                         f"carry {self.known_object} through the arena, {self.seconds:g} s; Ctrl-C ends it earlier"
                     )
-                stop.wait(self.seconds)
+                end_s = time.monotonic() + self.seconds
+                while not stop.wait(WAIT_S) and time.monotonic() < end_s:
+                    _take(verifier, messages)
                 remove()
             if self._placed_cameras(client) != cameras:
                 raise ConfigError("the server's rig changed during the verification; start again")
-        for message in messages:
-            verifier.add(message)
+        _take(verifier, messages)
         return cameras, verifier.report()
 
     def _placed_cameras(self, client: Arena) -> dict[str, Camera]:
@@ -145,3 +149,9 @@ class Verify:
                 f"the server uses another rig than {self.rig}; leave --rig out, or run roundel calibrate apply"
             )
         return rig.placed()
+
+
+def _take(verifier: Verifier, messages: deque[Markers]) -> None:
+    """Give the messages that have arrived to the verifier, which keeps less of them."""
+    while messages:
+        verifier.add(messages.popleft())
