@@ -44,6 +44,13 @@ class FramePoses:
         xy (2, N), whiten (2, 2, N), single (B,).
         """
 
+    def differentiate_by_camera(self, discs: DiscColumns, whiten: Array, by_focal: Array, /) -> Array:
+        """(N, 2, 8) whitened derivatives of the centres by errors of the cameras; zeros where not visible.
+
+        Rotation and translation in the camera's frame (rad, m), clock offset (s), and logarithm of the focal length,
+        by which the derivatives of the undistorted detections are `by_focal` (2, N). whiten (2, 2, N).
+        """
+
     def linearize_outlines(
         self, discs: DiscColumns, axes: Array, angle: Array, scale: Array, sigma: Array, /
     ) -> Array:
@@ -141,6 +148,25 @@ def reweigh(
 
 def residuals(equations: Array, body: Index, steps: Array, /) -> Array:
     """(2, N) whitened residuals of the equations after steps (K, 12)."""
+
+def eliminate_bodies(
+    equations: Array,
+    weights: Array,
+    body: Index,
+    camera: Index,
+    information: Array,
+    right: Array,
+    n_cameras: int,
+    damping: float,
+    /,
+) -> tuple[Array, Array]:
+    """(8 C, 8 C + 1) normal equations of C cameras with their right side, B bodies eliminated (Schur complement).
+
+    Also (B, 12, 8 C + 1): the inverse of each body's block times its border and its right side. Equations
+    (N, 2, 12 + 8 + 1): derivatives by body and camera, and residuals; weights, body and camera (N,); information and
+    right side (B, 12) of the bodies beside the observations; `damping` is the share by which their diagonals grow.
+    Raises RuntimeError where a body is not determined.
+    """
 
 def inverses(information: Array, /) -> Array:
     """(K, 12, 12) inverses of positive definite matrices; raises RuntimeError for others."""

@@ -88,6 +88,28 @@ void linearize(const FramePoses& poses, const CentreObservations& observed, Equa
     }
 }
 
+void differentiate(const FramePoses& poses, const Discs& discs, Columns<4> whiten, Columns<2> by_focal,
+                   CameraDerivatives* to) {
+    for (size_t k = 0; k < discs.size(); ++k) {
+        const BodyInCamera body = poses.at(discs, k);
+        const DiscOnBody disc = discs.at(k);
+        const DiscView expected = view_disc(body, disc);
+        to[k] = {};
+        if (!std::isfinite(expected.x + expected.y)) continue;
+        const Vector velocity = body.v_cam + cross(body.omega_cam, body.R_cam * disc.position);
+        const Vector turning = cross(body.omega_cam, expected.normal);
+        for (int a = 0; a < 2; ++a) {
+            const double wx = whiten.at(2 * a, k), wy = whiten.at(2 * a + 1, k);
+            const DiscDerivatives by = differentiate(expected, disc.radius, wx, wy);
+            double* row = to[k].B[a];
+            write(row, cross(by.centre, expected.centre) + cross(by.normal, expected.normal));
+            write(row + 3, -1.0 * by.centre);
+            row[6] = dot(by.centre, velocity) + dot(by.normal, turning);
+            row[7] = wx * by_focal.at(0, k) + wy * by_focal.at(1, k);
+        }
+    }
+}
+
 void linearize(const FramePoses& poses, const OutlineObservations& observed, Equations* to) {
     const Discs& discs = observed.discs;
     for (size_t k = 0; k < discs.size(); ++k) {

@@ -23,6 +23,20 @@ struct CentreObservations {
 };
 void linearize(const FramePoses& poses, const CentreObservations& observed, Equations* to);
 
+constexpr int kCameraErrors = 8;  // rotation and position (camera frame), clock offset, log focal length
+
+/// Derivatives of one whitened centre by the errors of its camera, a row for each coordinate. Both are zero
+/// where the disc is not visible.
+struct CameraDerivatives {
+    double B[2][kCameraErrors];
+};
+
+/// Writes the derivatives of N expected centres, times `whiten`. A rotation w and a translation t of the camera in
+/// its own frame move points in that frame by p x w - t; a clock offset delays the capture, in seconds;
+/// `by_focal` holds the derivatives by the logarithm of the focal length, undistorted coordinates.
+void differentiate(const FramePoses& poses, const Discs& discs, Columns<4> whiten, Columns<2> by_focal,
+                   CameraDerivatives* to);
+
 /// N detected outlines: full axes, direction of the major axis, and the standard deviation of a shear.
 ///
 /// Their shears determine the normal of a body with few visible markers. Their sizes are not used because

@@ -86,20 +86,14 @@ void reweigh_body(BodySums& sums) {
         for (int j = 0; j < i; ++j) sums.H[j][i] = sums.H[i][j];
 }
 
-/// The indices of the equations in the order of their bodies: those of body b are from `first[b]` to `first[b
-/// + 1]`.
-struct ByBody {
-    std::vector<size_t> first, indices;
-
-    explicit ByBody(const EquationSystem& system) : first(system.n_bodies + 1), indices(system.n_equations) {
-        for (size_t k = 0; k < system.n_equations; ++k) ++first[system.body[k] + 1];
-        std::partial_sum(first.begin(), first.end(), first.begin());
-        std::vector<size_t> next = first;
-        for (size_t k = 0; k < system.n_equations; ++k) indices[next[system.body[k]]++] = k;
-    }
-};
-
 }  // namespace
+
+ByBody::ByBody(const EquationSystem& system) : first(system.n_bodies + 1), indices(system.n_equations) {
+    for (size_t k = 0; k < system.n_equations; ++k) ++first[system.body[k] + 1];
+    std::partial_sum(first.begin(), first.end(), first.begin());
+    std::vector<size_t> next = first;
+    for (size_t k = 0; k < system.n_equations; ++k) indices[next[system.body[k]]++] = k;
+}
 
 void reweigh(const EquationSystem& system, ErrorMatrix* H, ErrorVector* g, double* weights) {
     BodySums sums;

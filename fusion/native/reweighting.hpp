@@ -21,6 +21,14 @@ struct EquationSystem {
     size_t n_equations, n_bodies;
 };
 
+/// The indices of the equations in the order of their bodies: those of body b are from `first[b]` to
+/// `first[b + 1]`. It reads only `body` and the numbers of a system.
+struct ByBody {
+    std::vector<size_t> first, indices;
+
+    explicit ByBody(const EquationSystem& system);
+};
+
 /// Adds priors and weighted equations: iteratively reweighted least squares (Holland and Welsch 1977) with
 /// Cauchy weights, until the weights of a body converge.
 ///

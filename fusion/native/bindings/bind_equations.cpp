@@ -4,6 +4,7 @@
 #include <algorithm>
 
 #include "arrays.hpp"
+#include "elimination.hpp"
 #include "motion_model.hpp"
 
 namespace roundel::fusion {
@@ -49,6 +50,25 @@ Out inverses(const Covariances& information) {
     return covariances;
 }
 
+auto eliminate_bodies(const In<double, -1, 2, 21>& equations, const Numbers& weights, const Index& body,
+                      const Index& camera, const In<double, -1, 12>& information,
+                      const In<double, -1, 12>& right, size_t n_cameras, double damping) {
+    const size_t n = weights.size(), n_bodies = information.shape(0);
+    require_equal(n, {equations.shape(0), body.size(), camera.size()});
+    require_equal(n_bodies, {right.shape(0)});
+    const JointSystem system{reinterpret_cast<const JointEquations*>(equations.data()), weights.data(),
+                             below(n_bodies, body), below(n_cameras, camera), n, n_bodies, n_cameras};
+    const BodyPriors priors{reinterpret_cast<const ErrorVector*>(information.data()),
+                            reinterpret_cast<const ErrorVector*>(right.data()), damping};
+    const size_t d = kCameraErrors * n_cameras;
+    auto [reduced, to_reduced] = make({d, d + 1});
+    auto [by_body, to_body] = make({n_bodies, kErrors, d + 1});
+    unlocked([&, to_reduced = to_reduced, to_body = to_body] {
+        eliminate(system, priors, to_reduced, to_body);
+    });
+    return std::make_tuple(reduced, by_body);
+}
+
 auto predict_bodies(const BodyStates& bodies, const Covariances& P, const Numbers& dt,
                     const In<double, -1, 2>& densities, const In<bool, -1>& single) {
     const size_t n = bodies.size();
@@ -76,6 +96,7 @@ void bind_equations(nb::module_& m) {
     m.def("predict", &predict_bodies);
     m.def("reweigh", &reweigh_arrays);
     m.def("residuals", &residuals_of);
+    m.def("eliminate_bodies", &eliminate_bodies);
     m.def("inverses", &inverses);
 }
 

@@ -67,6 +67,18 @@ Out linearize_centres(const FramePoses& poses, const DiscColumns& columns_of, co
     return equations;
 }
 
+Out differentiate_by_camera(const FramePoses& poses, const DiscColumns& columns_of, const Matrices2& whiten,
+                            const Pairs& by_focal) {
+    const Discs discs = discs_of(poses, columns_of);
+    const auto scales = columns<4>(whiten, discs.size());
+    const auto focal = columns<2>(by_focal, discs.size());
+    auto [derivatives, to] = make({discs.size(), 2, kCameraErrors});
+    unlocked([&, to = to] {
+        differentiate(poses, discs, scales, focal, reinterpret_cast<CameraDerivatives*>(to));
+    });
+    return derivatives;
+}
+
 Out linearize_outlines(const FramePoses& poses, const DiscColumns& columns_of, const Pairs& axes,
                        const Numbers& angle, const Matrices2& scale, const Numbers& sigma) {
     const Discs discs = discs_of(poses, columns_of);
@@ -107,6 +119,7 @@ void bind_poses(nb::module_& m) {
         .def(nb::init<const BodyStates&, const CameraExposures&>())
         .def("views", &views_of)
         .def("linearize_centres", &linearize_centres)
+        .def("differentiate_by_camera", &differentiate_by_camera)
         .def("linearize_outlines", &linearize_outlines);
     m.def("shears", &shears_of);
 }

@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which camera is at fault? A generalized likelihood ratio over hypotheses about the cameras.
+
+Robots and cameras of some keyframes are one least-squares problem (Triggs et al. 2000). A hypothesis frees some errors
+of some cameras: the pose, the clock offset, the focal length. All other errors keep the prior of the calibration. The
+robots are eliminated body by body (Schur complement); observations have Cauchy weights. The hypothesis with the lowest
+cost is accepted only if it beats every other one by the margin that chi-square asks (Basseville and Nikiforov 1993,
+section 2.4.2), each with a penalty for its free parameters (Schwarz 1978). Otherwise the data do not decide.
+
+docs/design/rig_graph.md derives the equations.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2
+
+from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.geometry.pose import rotation_from_vector
+from fusion import _core
+from fusion.model.observations import MatchedObservations
+from fusion.model.states import OMEGA, VELOCITY, States
+
+# The errors of a camera by their columns: rotation and translation in its own frame (rad, m), clock offset (s), and
+# logarithm of the focal length.
+ERRORS = 8
+CAUSES: dict["Cause", slice] = {"pose": slice(0, 6), "clock": slice(6, 7), "focal": slice(7, 8)}
+Cause = Literal["pose", "clock", "focal"]
+# Standard deviations of errors that a hypothesis frees: weak, they only keep the system regular.
+FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [1.0, 0.1])
+POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
+FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
+MAX_ITERATIONS, CONVERGED = 20, 1e-4  # relative decrease of the cost
+FIRST_DAMPING = 1e-4
+BEHIND = 1e6  # squared residual of a disc that is behind its camera
+ADEQUATE = 1.5  # ratio of the mean robust cost to that of noise, up to which a model explains the residuals
+MIN_FOR_PAIRS = 3  # cameras; of fewer, two are no minority
+MAX_SUSPECTS = 4  # cameras that are combined to pairs: those that explain most alone
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """Keyframes as one problem of C cameras and B bodies: each robot in each keyframe is a body of its own.
+
+    Attributes:
+        names: (C,) of the cameras.
+        T: (C, 4, 4) their calibrated poses T_world_cam.
+        prior: (C, 8, 8) information about the errors of each camera.
+        states: B bodies, with velocities that do not depend on single frames.
+        velocity_sigma: (B, 2) of these: angular and linear, rad/s and m/s.
+        single: (B,) bodies with one marker.
+        observations: N detections of all keyframes with their discs.
+        by_focal: (2, N) derivatives of the undistorted detections by the logarithm of the focal length.
+        keyframe: (B,) of each body.
+    """
+
+    names: tuple[str, ...]
+    T: Array
+    prior: Array
+    states: States
+    velocity_sigma: Array
+    single: Mask
+    observations: MatchedObservations
+    by_focal: Array
+    keyframe: Index
+
+    @property
+    def camera(self) -> Index:
+        """(N,) of each observation."""
+        return self.observations.detections.camera
+
+    def select(self, keyframes: Mask) -> "Window":
+        """The window of some of the keyframes."""
+        bodies = np.flatnonzero(keyframes[self.keyframe])
+        row = np.full(len(self.keyframe), -1)
+        row[bodies] = np.arange(len(bodies))
+        kept = np.flatnonzero(row[self.observations.discs.body] >= 0)
+        seen = self.observations.select(kept)
+        discs = replace(seen.discs, body=row[seen.discs.body])
+        return replace(
+            self,
+            states=self.states.select(bodies),
+            velocity_sigma=self.velocity_sigma[bodies],
+            single=self.single[bodies],
+            observations=replace(seen, discs=discs),
+            by_focal=np.ascontiguousarray(self.by_focal[:, kept]),
+            keyframe=self.keyframe[bodies],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """The errors (C, 8) that are free, and where the search for them begins (C, 8); `cameras` are those at fault."""
+
+    cause: Cause | None
+    cameras: tuple[int, ...]
+    free: Mask
+    start: Array
+
+    @classmethod
+    def of(
+        cls, cause: Cause | None, cameras: Sequence[int], n_cameras: int, start: Array | None = None
+    ) -> "Hypothesis":
+        """Errors of one cause in some cameras; without a cause, none or all errors of these cameras."""
+        free = np.zeros((n_cameras, ERRORS), bool)
+        free[list(cameras), CAUSES[cause] if cause else slice(0, ERRORS)] = True
+        begin = np.zeros((n_cameras, ERRORS)) if start is None else np.where(free, start, 0.0)
+        return cls(cause, tuple(cameras), free, begin)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A hypothesis after its fit.
+
+    Attributes:
+        cost: robust sum of squares, with the priors.
+        errors: (C, 8) of the cameras, to be applied to `Window.T` by `retract`.
+        prior: (8 C, 8 C) information about the errors by the calibration, where they are not free.
+        reduced: (8 C, 8 C + 1) normal equations of the errors by the observations, robots eliminated.
+        by_camera: (N, 2, 8) whitened derivatives of the observations by the errors of their cameras.
+        squared: (N,) squared whitened residuals; NaN where the disc is not visible.
+    """
+
+    hypothesis: Hypothesis
+    cost: float
+    errors: Array
+    prior: Array
+    reduced: Array
+    by_camera: Array
+    squared: Array
+
+    @property
+    def penalty(self) -> float:
+        """Of the free parameters (Bayesian information criterion)."""
+        return float(self.hypothesis.free.sum() * np.log(2 * len(self.squared)))
+
+    @property
+    def variance(self) -> float:
+        """Of a whitened residual, by the median, not below 1."""
+        known = self.squared[np.isfinite(self.squared)]
+        return max(1.0, float(np.median(known) / chi2.ppf(0.5, 2))) if len(known) else 1.0
+
+    @property
+    def misfit(self) -> float:
+        """Mean squared residual in units of its expectation, not below 1."""
+        known = self.squared[np.isfinite(self.squared)]
+        return max(1.0, float(known.mean()) / 2) if len(known) else 1.0
+
+    def is_adequate(self) -> bool:
+        """Whether the residuals are noise of any variance: a wrong model leaves more large ones."""
+        variance = float(np.median(np.nan_to_num(self.squared, nan=BEHIND)) / chi2.ppf(0.5, 2))
+        expected = chi2.expect(lambda x: np.log1p(max(1.0, variance) * x / _core.CAUCHY**2), (2,))
+        return bool(self._robust().mean() < ADEQUATE * expected)
+
+    def _robust(self) -> Array:
+        """(N,) robust costs, in units of `CAUCHY`^2."""
+        return np.log1p(np.nan_to_num(self.squared, nan=BEHIND) / _core.CAUCHY**2)
+
+    def by_keyframe(self, window: Window) -> Array:
+        """(K,) mean robust cost of an observation in each keyframe; NaN without any."""
+        keyframe = window.keyframe[window.observations.discs.body]
+        count = np.bincount(keyframe, minlength=int(window.keyframe.max()) + 1)
+        return np.bincount(keyframe, self._robust(), len(count)) / np.where(count, count, np.nan)
+
+    def covariance(self, camera: int) -> Array:
+        """(8, 8) of the errors of a camera."""
+        rows = slice(ERRORS * camera, ERRORS * (camera + 1))
+        information = self.reduced[:, :-1] + self.prior
+        return self.variance * np.asarray(np.linalg.inv(information), float)[rows, rows]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What a window shows.
+
+    Attributes:
+        cause: of the accepted hypothesis; None if there is no fault or the data do not decide.
+        cameras: at fault; if the data do not decide, those that contradict each other; empty without a fault.
+        fit: of the best hypothesis.
+        misfit: mean squared residual without a fault in units of its expectation, not below 1.
+    """
+
+    cause: Cause | None
+    cameras: tuple[int, ...]
+    fit: Fit
+    misfit: float = 1.0
+
+
+def retract(T: Array, errors: Array) -> Array:
+    """Poses (C, 4, 4) displaced by errors (C, 8)."""
+    moved = T.copy()
+    moved[:, :3, 3] += np.einsum("cij,cj->ci", T[:, :3, :3], errors[:, 3:6])
+    moved[:, :3, :3] = T[:, :3, :3] @ rotation_from_vector(errors[:, :3])
+    return moved
+
+
+def judge(window: Window, starts: Array) -> Verdict:
+    """Compare the hypotheses.
+
+    Args:
+        window: the keyframes.
+        starts: (C, 8) errors that explain the images of each camera if only this one is at fault.
+    """
+    n = len(window.names)
+    none = fit(window, Hypothesis.of(None, (), n))
+    if not is_contradicted(none, n):
+        return Verdict(None, (), none)
+    everything = fit(window, Hypothesis.of(None, range(n), n, starts))
+    if not everything.is_adequate():  # nor is any other hypothesis
+        return Verdict(None, tuple(range(n)), everything, none.misfit)
+    fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in range(n)]
+    if n > MIN_FOR_PAIRS:
+        suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
+        fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
+    return replace(decide([none, *fits, everything], n), misfit=none.misfit)
+
+
+def is_contradicted(none: Fit, n_cameras: int) -> bool:
+    """Whether errors of the cameras explain more than chance: the score test (Rao 1948) of all of them together."""
+    observed, gradient = none.reduced[:, :-1], none.reduced[:, -1]
+    score = gradient @ np.linalg.solve(observed + np.diag(np.tile(FREE_SIGMA**-2, n_cameras)), gradient)
+    return bool(score > none.variance * chi2.isf(FALSE_ALARM, ERRORS * n_cameras))
+
+
+def decide(fits: Sequence[Fit], n_cameras: int) -> Verdict:
+    """Accept the best hypothesis if it beats all others, and if a majority of the cameras is not at fault.
+
+    A hypothesis that frees more than the best one is no rival: it contains that one, and its penalty says that it
+    explains no more.
+    """
+    variance = min(f.variance for f in fits)
+    score = {id(f): f.cost / variance + f.penalty for f in fits}
+    best = min(fits, key=lambda f: score[id(f)])
+    limit = score[id(best)] + chi2.isf(FALSE_ALARM, CAUSES["pose"].stop)
+    rivals = [
+        f for f in fits if not (best.hypothesis.free <= f.hypothesis.free).all() and score[id(f)] < limit
+    ]
+    cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
+    if not rivals and not cameras:
+        return Verdict(None, (), best)
+    if not rivals and cause is not None and 2 * len(cameras) < n_cameras:
+        return Verdict(cause, cameras, best)
+    return Verdict(None, tuple(sorted({k for f in (best, *rivals) for k in f.hypothesis.cameras})), best)
+
+
+def _suspects(poses: Sequence[Fit]) -> list[int]:
+    ranked = sorted(poses, key=lambda f: f.cost)[:MAX_SUSPECTS]
+    return sorted(f.hypothesis.cameras[0] for f in ranked)
+
+
+def fit(window: Window, hypothesis: Hypothesis) -> Fit:
+    """Fit cameras and robots from the start of the hypothesis, by Levenberg-Marquardt with Cauchy weights."""
+    at = _evaluate(window, hypothesis, hypothesis.start, np.zeros((len(window.states), 12)))
+    damping = FIRST_DAMPING
+    for _ in range(MAX_ITERATIONS):
+        by_camera, by_body = _step(window, hypothesis, at, damping)
+        tried = _evaluate(window, hypothesis, at.errors + by_camera, at.bodies + by_body)
+        if tried.cost >= at.cost:
+            damping *= 10
+            continue
+        is_converged = at.cost - tried.cost < CONVERGED * at.cost
+        at, damping = tried, damping / 10
+        if is_converged:
+            break
+    reduced, _ = _eliminate(window, at, 0.0)
+    return Fit(hypothesis, at.cost, at.errors, at.prior, reduced, at.rows[:, :, 12:-1], at.squared)
+
+
+def _prior(window: Window, free: Mask) -> Array:
+    """(8 C, 8 C) information about the errors, without that about the free ones."""
+    n = len(window.names)
+    full = np.zeros((n, ERRORS, n, ERRORS))
+    for k in range(n):
+        held = ~free[k]
+        full[k, :, k] = window.prior[k] * np.outer(held, held) + np.diag(free[k] / FREE_SIGMA**2)
+    return full.reshape(n * ERRORS, n * ERRORS)
+
+
+def _body_prior(window: Window) -> Array:
+    """(B, 12) information about the errors of the bodies."""
+    rotation, position = POSE_SIGMA
+    weak = np.tile([rotation**-2.0] * 3 + [position**-2.0] * 3 + [0.0] * 6, (len(window.states), 1))
+    weak[:, OMEGA] = (window.velocity_sigma[:, 0] ** -2)[:, None]
+    weak[:, VELOCITY] = (window.velocity_sigma[:, 1] ** -2)[:, None]
+    return weak
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    """A point of the search: errors of cameras (C, 8) and bodies (B, 12), and the equations there.
+
+    Attributes:
+        prior: (8 C, 8 C) information about the errors of the cameras.
+        rows: (N, 2, 12 + 8 + 1) derivatives by body and camera, and residuals.
+        squared: (N,) squared residuals; NaN where the disc is not visible.
+        cost: robust sum of squares, with the priors of what is not free.
+    """
+
+    errors: Array
+    bodies: Array
+    prior: Array
+    rows: Array
+    squared: Array
+    cost: float
+
+
+def _evaluate(window: Window, hypothesis: Hypothesis, errors: Array, bodies: Array) -> _Point:
+    """Linearize at a point."""
+    states, seen = window.states.retract(bodies), window.observations.detections
+    T, camera = retract(window.T, errors), seen.exposures.camera
+    R, centres = T[camera, :3, :3].transpose(0, 2, 1), T[camera, :3, 3]
+    tau = seen.exposures.tau + errors[camera, 6]
+    exposures = _core.CameraExposures(
+        np.ascontiguousarray(R), np.ascontiguousarray(centres), tau, np.zeros(len(camera))
+    )
+    poses, discs = _core.FramePoses(states.bodies, exposures), window.observations.discs.columns
+    whiten = window.observations.whiten
+    by_body = poses.linearize_centres(discs, seen.xy, whiten, window.single)
+    by_camera = poses.differentiate_by_camera(discs, whiten, window.by_focal)
+    visible = (by_camera != 0).any((1, 2))
+    r = by_body[:, :, 12] - by_camera[:, :, 7] * errors[window.camera, 7, None]
+    squared = np.where(visible, np.sum(r**2, 1), np.nan)
+    capped = np.nan_to_num(squared, nan=BEHIND)
+    prior, held = _prior(window, hypothesis.free), np.where(hypothesis.free, 0.0, errors).ravel()
+    cost = _core.CAUCHY**2 * np.log1p(capped / _core.CAUCHY**2).sum()
+    cost += held @ prior @ held + np.sum(bodies**2 * _body_prior(window))
+    rows = np.concatenate([by_body[:, :, :12], by_camera, r[:, :, None]], 2)
+    return _Point(errors, bodies, prior, rows, squared, float(cost))
+
+
+def _eliminate(window: Window, at: _Point, damping: float) -> tuple[Array, Array]:
+    """See `_core.eliminate_bodies`."""
+    weights = 1 / (1 + np.nan_to_num(at.squared) / _core.CAUCHY**2)
+    prior, n = _body_prior(window), len(window.names)
+    body, camera = window.observations.discs.body, window.camera
+    return _core.eliminate_bodies(at.rows, weights, body, camera, prior, -prior * at.bodies, n, damping)
+
+
+def _step(window: Window, hypothesis: Hypothesis, at: _Point, damping: float) -> tuple[Array, Array]:
+    """Steps (C, 8) of the cameras and (B, 12) of the bodies."""
+    reduced, by_body = _eliminate(window, at, damping)
+    H = reduced[:, :-1] + at.prior
+    H[np.diag_indices(len(H))] += damping * np.abs(np.diag(reduced))
+    step = np.asarray(np.linalg.solve(H, reduced[:, -1] - at.prior @ at.errors.ravel()), float)
+    return step.reshape(-1, ERRORS), by_body[:, :, -1] - by_body[:, :, :-1] @ step

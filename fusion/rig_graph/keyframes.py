@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Keyframes: frame sets that the rig graph keeps, and which detection of theirs shows which marker.
+
+A camera at fault shows its markers elsewhere than its calibration predicts, so detections are assigned again, camera by
+camera: the image shift on which most pairs of expected and detected roundels agree gives first correspondences;
+Gauss-Newton on the pose of the camera, with Cauchy weights, alternates with new correspondences in smaller gates. That
+pose is where the search of a hypothesis begins.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from calib.rig.camera import FOCAL_STABILITY, Camera, pixel_jacobians
+from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_rotation
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.observations import (
+    CameraArray,
+    DetectionTable,
+    Exposures,
+    MarkerTable,
+    MatchedObservations,
+)
+from fusion.model.states import States
+from fusion.monitoring.clocks.time_search import Snapshot
+from fusion.monitoring.expected_views import ExpectedViews
+from fusion.rig_graph.hypotheses import ERRORS, Window
+
+INTERVAL_NS = 90_000_000  # between keyframes: a tenth of a second, at 30 frame sets a second too
+HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its robots
+MAX_ROBOTS = 4  # of a keyframe; the next one has others
+SEARCH_PX, BIN_PX = (
+    120.0,
+    6.0,
+)  # largest image shift: 8 degrees at a focal length of 840 px; resolution of the search
+# Between expected and detected markers: robots that follow a camera at fault are expected pixels away, and discs of
+# other markers are at least their own diameter away.
+GATES_PX = (16.0, 10.0, 8.0, 8.0)
+FOUND = 0.8  # of the expected markers within the last gate: detections need no other assignment
+ITERATIONS = 5
+MIN_SEEN = 4  # detections of a robot in a keyframe: 8 equations of its pose, 6
+OFFSET_SIGMA_S = 5e-4  # of a calibrated clock offset, beside what the stamps claim
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameView:
+    """A frame with the markers that it should show by the calibration.
+
+    Attributes:
+        frame: the frame.
+        rows: (N,) of the marker table.
+        points: (3, N) world frame, which project to the centres of their outlines.
+        uv: (N, 2) these centres, pixels.
+    """
+
+    frame: CalibratedFrame
+    rows: Index
+    points: Array
+    uv: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A frame set with K of the robots that were tracked all around it.
+
+    Attributes:
+        views: of all cameras, also of those at fault.
+        robots: (K,) rows of the robots.
+        states: of these, with mean velocities.
+    """
+
+    t_ns: int
+    views: tuple[FrameView, ...]
+    robots: Index
+    states: States
+
+
+class Keyframes:
+    """The last keyframes.
+
+    Args:
+        cameras: cameras of the rig.
+        markers: of all robots.
+        most: keyframes that are kept.
+    """
+
+    def __init__(self, cameras: CameraArray, markers: MarkerTable, most: int) -> None:
+        self._cameras, self._markers = cameras, markers
+        self.kept: deque[Keyframe] = deque(maxlen=most)
+        self._history: deque[Snapshot] = deque()
+        self._pending: deque[FrameSet] = deque()
+        self._turn = 0
+
+    def clear(self) -> None:
+        """Forget all keyframes: cameras or robots are others."""
+        self.kept.clear()
+        self._pending.clear()
+        self._history.clear()
+
+    def add(self, frame_set: FrameSet, now: Snapshot) -> bool:
+        """Add a frame set and the robots after its update; whether there is a new keyframe, `HALF_NS` old."""
+        self._history.append(now)
+        while self._history[0].t_ns < now.t_ns - 4 * HALF_NS:
+            self._history.popleft()
+        if not self._pending or frame_set.t_ns >= self._pending[-1].t_ns + INTERVAL_NS:
+            self._pending.append(frame_set)
+        if self._pending[0].t_ns > now.t_ns - HALF_NS:
+            return False
+        keyframe = self._keyframe(self._pending.popleft())
+        if keyframe is not None:
+            self.kept.append(keyframe)
+        return keyframe is not None
+
+    def _keyframe(self, frame_set: FrameSet) -> Keyframe | None:
+        """The robots of a frame set with mean velocities around it, which stamps of one frame do not change."""
+        t_ns = frame_set.t_ns
+        first, now, last = (
+            min(self._history, key=lambda s: abs(s.t_ns - at))
+            for at in (t_ns - HALF_NS, t_ns, t_ns + HALF_NS)
+        )
+        seconds = (last.t_ns - first.t_ns) * 1e-9
+        known = np.flatnonzero(first.tracked & now.tracked & last.tracked)
+        if now.t_ns != t_ns or seconds < 1e-9 * HALF_NS or not len(known):
+            return None
+        self._turn += MAX_ROBOTS
+        robots = np.sort(np.roll(known, -self._turn % len(known))[:MAX_ROBOTS])
+        states = now.states.select(robots)
+        turned = last.states.R[robots] @ first.states.R[robots].transpose(0, 2, 1)
+        moved = last.states.p[robots] - first.states.p[robots]
+        states = replace(states, v=moved / seconds, omega=vector_from_rotation(turned) / seconds)
+        views = tuple(self._view(frame, t_ns, now.states, robots) for frame in frame_set.frames)
+        return Keyframe(t_ns, views, robots, states)
+
+    def _view(self, frame: CalibratedFrame, t_ns: int, states: States, robots: Index) -> FrameView:
+        markers, tau = self._markers, (frame.t_ns - t_ns) * 1e-9
+        rows = np.flatnonzero(np.isin(markers.robot, robots))
+        seen = ExpectedViews.of(self._cameras, frame.camera, states, tau, (markers, rows), frame.readout_s)
+        return FrameView(frame, seen.rows, seen.points, seen.uv)
+
+
+def window_of(
+    keyframes: Sequence[Keyframe],
+    cameras: CameraArray,
+    markers: MarkerTable,
+    densities: Array,
+    floor_px: float,
+) -> tuple[Window, Array]:
+    """The problem of some keyframes, and for each camera the errors (C, 8) that explain its images alone.
+
+    Args:
+        keyframes: at least one.
+        cameras: C cameras of the rig.
+        markers: of all robots.
+        densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
+        floor_px: the error of a calibration in the image (`Limits`).
+    """
+    starts = np.zeros((len(cameras.names), ERRORS))
+    found: list[list[tuple[CalibratedFrame, Index, Index]]] = [[] for _ in keyframes]
+    for k, name in enumerate(cameras.names):
+        views = _views(keyframes, name)
+        T, matches = _match(cameras[name], [view for _, view in views])
+        inverse = np.linalg.inv(cameras[name].matrix()) @ T
+        starts[k, :3], starts[k, 3:6] = vector_from_rotation(inverse[None, :3, :3])[0], inverse[:3, 3]
+        for (number, view), (rows, detections) in zip(views, matches, strict=True):
+            found[number].append((view.frame, view.rows[rows], detections))
+    return _assemble(keyframes, found, cameras, markers, (densities, floor_px)), starts
+
+
+def _views(keyframes: Sequence[Keyframe], name: str) -> list[tuple[int, FrameView]]:
+    """The views of a camera, each with the number of its keyframe."""
+    return [(k, v) for k, keyframe in enumerate(keyframes) for v in keyframe.views if v.frame.camera == name]
+
+
+def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tuple[Index, Index]]]:
+    """T_world_cam (4, 4) that explains the images, and rows of expected and of detected roundels by view.
+
+    Views that show their markers where the calibration expects them need no other pose: a camera that was moved in the
+    meantime has some of both kinds.
+    """
+    T, matches = camera.matrix(), [_nearest(v.uv, v.frame.roundels.uv, GATES_PX[-1]) for v in views]
+    others = [k for k, v in enumerate(views) if len(matches[k][0]) < FOUND * len(v.rows)]
+    if sum(len(views[k].rows) for k in others) < ERRORS:
+        return T, matches
+    T, found = _match_moved(camera, [views[k] for k in others])
+    for k, match in zip(others, found, strict=True):
+        matches[k] = match if len(match[0]) >= len(matches[k][0]) else matches[k]
+    return T, matches
+
+
+def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tuple[Index, Index]]]:
+    """The same for views that show their markers elsewhere."""
+    T, matches = camera.matrix(), [(np.empty(0, np.intp), np.empty(0, np.intp)) for _ in views]
+    shift, points = _image_shift(views), np.concatenate([view.points for view in views], axis=1).T
+    of_view = np.cumsum([len(view.rows) for view in views])[:-1]
+    for gate in GATES_PX:
+        moved = msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
+        expected = np.split(moved.project_world(points) + shift, of_view)
+        matches = [_nearest(uv, v.frame.roundels.uv, gate) for uv, v in zip(expected, views, strict=True)]
+        pairs = list(zip(views, matches, strict=True))
+        shown = np.concatenate([v.points.T[rows] for v, (rows, _) in pairs])
+        if len(shown) < ERRORS:
+            return camera.matrix(), matches
+        T = _fit_pose(camera, T, shown, np.concatenate([v.frame.roundels.uv[d] for v, (_, d) in pairs]))
+        shift = np.zeros(2)
+    return T, matches
+
+
+def _image_shift(views: Sequence[FrameView]) -> Array:
+    """(2,) the image shift on which most pairs of expected and detected roundels agree, pixels."""
+    size = int(SEARCH_PX / BIN_PX)
+    votes = np.zeros((2 * size + 1, 2 * size + 1))
+    off = np.concatenate([(v.frame.roundels.uv[None] - v.uv[:, None]).reshape(-1, 2) for v in views])
+    off = off[(np.abs(off) < SEARCH_PX).all(1)]
+    np.add.at(votes, tuple(np.round(off / BIN_PX).astype(int).T + size), 1)
+    smooth = sum(np.roll(votes, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))
+    best = (np.array(np.unravel_index(np.argmax(smooth), votes.shape)) - size) * BIN_PX
+    near = off[np.linalg.norm(off - best, axis=1) < 2 * BIN_PX]
+    return np.median(near, axis=0) if len(near) else np.zeros(2)
+
+
+def _nearest(expected: Array, seen: Array, gate_px: float) -> tuple[Index, Index]:
+    """Rows of expected (N, 2) and seen (M, 2) points that are each other's nearest, within the gate."""
+    if not len(expected) or not len(seen):
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    off = np.linalg.norm(np.nan_to_num(expected, nan=np.inf)[:, None] - seen[None], axis=2)
+    rows, found = np.arange(len(expected)), off.argmin(1)
+    good = (off.argmin(0)[found] == rows) & (off[rows, found] < gate_px)
+    return rows[good], found[good]
+
+
+def _fit_pose(camera: Camera, T: Array, points: Array, measured: Array) -> Array:
+    """T_world_cam (4, 4) for the images (N, 2) of points (N, 3), by Gauss-Newton from `T` with Cauchy weights, 1 px."""
+    for _ in range(ITERATIONS):
+        uv, _, J, _ = pixel_jacobians(camera, (points - T[:3, 3]) @ T[:3, :3])
+        known = np.isfinite(uv).all(1)
+        J, off = J[known], (measured - uv)[known]
+        weighted = J / (1 + np.sum(off**2, 1))[:, None, None]
+        H = np.einsum("nai,naj->ij", weighted, J) + 1e-9 * np.eye(6)
+        step = np.linalg.solve(H, np.einsum("nai,na->i", weighted, off))
+        T = T.copy()
+        T[:3, 3] += T[:3, :3] @ step[3:]
+        T[:3, :3] = T[:3, :3] @ rotation_from_vector(step[:3])
+    return T
+
+
+def _assemble(
+    keyframes: Sequence[Keyframe],
+    found: Sequence[Sequence[tuple[CalibratedFrame, Index, Index]]],
+    cameras: CameraArray,
+    markers: MarkerTable,
+    noise: tuple[Array, float],
+) -> Window:
+    """The problem of matched detections: of each keyframe its frames, with rows of markers and of detections."""
+    densities, floor_px = noise
+    tables, discs, n_frames, n_bodies = [], [], 0, 0
+    for keyframe, matched in zip(keyframes, found, strict=True):
+        frames = FrameSet(keyframe.t_ns, tuple(frame for frame, _, _ in matched))
+        table = DetectionTable.of(frames, cameras, floor_px)
+        first = np.cumsum([0, *(len(frame.roundels) for frame in frames.frames)])
+        rows = np.concatenate(
+            [np.empty(0, np.intp), *(at + d for at, (_, _, d) in zip(first, matched, strict=False))]
+        )
+        marker = np.concatenate([np.empty(0, np.intp), *(m for _, m, _ in matched)])
+        rows, marker = rows.astype(np.intp), marker.astype(np.intp)
+        known = np.isfinite(table.xy[0, rows]) & _are_determined(markers.robot[marker], table.camera[rows])
+        table, marker = table.select(rows[known]), marker[known]
+        disc = markers.discs(marker, table.frame + n_frames)
+        body = n_bodies + np.searchsorted(keyframe.robots, disc.body)
+        tables.append(replace(table, frame=table.frame + n_frames))
+        discs.append(replace(disc, body=body, delay=table.delay))
+        n_frames, n_bodies = n_frames + len(frames.frames), n_bodies + len(keyframe.robots)
+    exposures = Exposures(
+        *(np.concatenate([getattr(t.exposures, c) for t in tables]) for c in Exposures.__slots__)
+    )
+    seen = replace(tables[0].joined(*tables[1:]), exposures=exposures)
+    observations = MatchedObservations.of_discs(seen, discs[0].joined(*discs[1:]))
+    robots = np.concatenate([keyframe.robots for keyframe in keyframes])
+    centre = np.array([[cameras[name].cx, cameras[name].cy] for name in cameras.names])
+    by_focal = np.linalg.solve(seen.scale.transpose(2, 0, 1), (seen.uv - centre[seen.camera].T).T[:, :, None])
+    states = keyframes[0].states.joined(*(keyframe.states for keyframe in keyframes[1:]))
+    single = np.bincount(markers.robot)[robots] == 1
+    return Window(
+        names=cameras.names,
+        T=np.array([cameras[name].matrix() for name in cameras.names]),
+        prior=_prior(cameras, states, exposures, floor_px),
+        states=states,
+        velocity_sigma=np.sqrt(
+            densities[robots] * (1e-9 * HALF_NS / 6)
+        ),  # of a velocity, beside its mean around it
+        single=single,
+        observations=observations,
+        by_focal=np.ascontiguousarray(by_focal[:, :, 0].T),
+        keyframe=np.repeat(np.arange(len(keyframes)), [len(keyframe.robots) for keyframe in keyframes]),
+    )
+
+
+def _are_determined(robot: Index, camera: Index) -> Mask:
+    """(N,) detections of robots that two cameras or more see, and that have `MIN_SEEN` detections."""
+    n = int(np.max(robot, initial=0)) + 1
+    views = np.unique(np.stack([robot, camera]), axis=1)[0]
+    determined = (np.bincount(views, minlength=n) >= 2) & (np.bincount(robot, minlength=n) >= MIN_SEEN)
+    return determined[robot]
+
+
+def _prior(cameras: CameraArray, states: States, exposures: Exposures, floor_px: float) -> Array:
+    """(C, 8, 8) information about the errors of the calibrated cameras; `floor_px` at the robots at least."""
+    found = np.zeros((len(cameras.names), ERRORS, ERRORS))
+    for k, name in enumerate(cameras.names):
+        camera, covariance = cameras[name], np.zeros((ERRORS, ERRORS))
+        range_m = np.linalg.norm(states.p - cameras.centres[k], axis=1).mean()
+        pixel = floor_px / cameras.focal[k]
+        covariance[range(6), range(6)] = np.repeat([pixel, pixel * range_m], 3) ** 2
+        if camera.covariance is not None:
+            covariance[:6, :6] += camera.covariance
+        stamps_s = exposures.tau_sigma[exposures.camera == k].max(initial=0.0)
+        covariance[6, 6] = OFFSET_SIGMA_S**2 + stamps_s**2
+        focal = camera.lens_sigma[0] / camera.fx if camera.lens_sigma is not None else FOCAL_STABILITY
+        covariance[7, 7] = max(focal, pixel) ** 2
+        found[k] = np.linalg.inv(covariance)
+    return found

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Finds cameras that were moved, and their new poses, from the robots of the last seconds.
+
+    frame sets            -> `Keyframes`: with the robots around them
+    twice a second        -> `judge`: which hypothesis about the cameras explains the keyframes?
+    a pose, decided       -> the camera is excluded until its pose is known, then used with it
+    undecided             -> the cameras that contradict each other are reported, and all are used as they are
+
+The server does not use it yet: `monitoring/extrinsics_monitor.py` decides there; docs/design/rig_graph.md says what is
+missing. No pose changes unless one hypothesis beats every other one: robots that follow a camera at fault make
+innocent cameras look wrong.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+from functools import partial
+
+import msgspec
+import numpy as np
+from scipy.stats import chi2
+
+from calib.rig.camera import Camera
+from camera_node.foundation.arrays import Array
+from camera_node.geometry.pose import Pose
+from fusion.model.frames import FrameSet
+from fusion.model.observations import CameraArray, MarkerTable
+from fusion.monitoring.clocks.time_search import Snapshot
+from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
+from fusion.rig_graph.hypotheses import (
+    FALSE_ALARM,
+    Fit,
+    Hypothesis,
+    Verdict,
+    Window,
+    fit,
+    judge,
+    retract,
+)
+from fusion.rig_graph.keyframes import Keyframe, Keyframes, window_of
+
+log = logging.getLogger("fusion")
+# Keyframes that are judged: the more, the better they determine a camera; the fewer, the sooner all of them are new.
+WINDOWS = 24, 12, 6
+CHECK_NS, SUSPICIOUS_NS = (
+    500_000_000,
+    200_000_000,
+)  # between two checks: usually, and while cameras contradict
+CHANGED = 2.0  # ratio of the mean robust costs in both halves of a window in which something changed
+USUAL = (
+    0.2  # mean robust cost that shows nothing: twice that of Gaussian noise, E[log(1 + chi2_2 / CAUCHY^2)]
+)
+CONFIRMED = 3  # checks that do not decide, before that is reported
+MAX_SIGMA_PX = 0.3  # of an accepted pose, at the markers that show it
+MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be far off either
+MAX_KNOWN = 4  # poses of a camera, to which it may return
+
+
+class RigMonitor:
+    """Judges the cameras of a rig.
+
+    Args:
+        cameras: cameras of the rig.
+        markers: of all robots.
+        densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
+        floor_px: the error of a calibration in the image (`Limits`).
+
+    Attributes:
+        excluded: names of moved cameras whose poses are not known yet.
+        pinned: names of cameras whose poses a user confirmed; these do not change.
+        contradicting: names of the cameras of which some are at fault, but the data do not decide which.
+        widening: factor of the variances of positions while cameras contradict each other.
+        executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
+    """
+
+    def __init__(self, cameras: CameraArray, markers: MarkerTable, densities: Array, floor_px: float) -> None:
+        self._cameras, self._markers = cameras, markers
+        self._densities, self._floor_px = densities, floor_px
+        self._keyframes = Keyframes(cameras, markers, max(WINDOWS))
+        self._job: Future[tuple[Window, Verdict] | None] | None = None
+        self._checked_ns = self._revision = self._n_undecided = 0
+        self._is_contradicted, self._clock = False, None
+        self.widening = 1.0
+        self.executor: Executor | None = None
+        self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
+        self.excluded: set[str] = set()
+        self.pinned: set[str] = set()
+        self.contradicting: tuple[str, ...] = ()
+
+    def inherit(self, old: "RigMonitor") -> None:
+        """Continue with the same cameras and other robots."""
+        self.inherit_poses(old)
+        self.excluded, self.executor = old.excluded, old.executor
+
+    def inherit_poses(self, old: "RigMonitor") -> None:
+        """The poses that another monitor of the same cameras knows, and those that a user confirmed."""
+        self._known, self.pinned = old._known, old.pinned
+
+    def remember(self, rigs: Iterable[Mapping[str, Camera]]) -> None:
+        """Poses of cameras in earlier rigs, oldest first, to which these cameras may return."""
+        for rig in rigs:
+            for name, camera in rig.items():
+                self._remember(name, camera)
+
+    def readmit(self, name: str) -> None:
+        """Use a camera that was calibrated again; its earlier poses are forgotten."""
+        self._use(name)
+        self._known.pop(name, None)
+
+    def pin(self, name: str) -> None:
+        """Use a camera whose pose a user confirmed; it does not change any more."""
+        self.readmit(name)
+        self.pinned.add(name)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether a camera is at fault, by more or other than its clock, or may be."""
+        return bool(self.excluded) or self._is_contradicted
+
+    def confirms_clock(self, name: str) -> bool:
+        """Whether the last keyframes are explained by the clock of this camera and by nothing else."""
+        return self._clock == name
+
+    def check(
+        self, frame_set: FrameSet, now: Snapshot, recalibrates: bool
+    ) -> tuple[ExtrinsicsCorrection, ...]:
+        """Judge the cameras if it is time; the cameras to exclude, and those to use with another pose.
+
+        Args:
+            frame_set: with the frames of excluded cameras.
+            now: the robots after the update with this frame set.
+            recalibrates: False for a shard that waits for the poses from another.
+        """
+        is_new, kept = self._keyframes.add(frame_set, now), self._keyframes.kept
+        wait_ns = SUSPICIOUS_NS if self.is_doubtful else CHECK_NS
+        if (
+            self._job is None
+            and is_new
+            and len(kept) >= min(WINDOWS)
+            and now.t_ns >= self._checked_ns + wait_ns
+        ):
+            self._checked_ns = now.t_ns
+            self._revision = self._cameras.revision
+            given = CameraArray(self._cameras.as_dict())  # which does not change while it is judged
+            job = partial(judge_latest, tuple(kept), given, self._markers, self._densities, self._floor_px)
+            self._job = _done(job) if self.executor is None else self.executor.submit(job)
+        if self._job is None or not self._job.done():
+            return ()
+        job, self._job = self._job, None
+        if self._revision != self._cameras.revision:
+            return ()
+        if (judged := job.result()) is None:
+            self._is_contradicted = True
+            return ()
+        return self._act(*judged, recalibrates)
+
+    def _act(self, window: Window, verdict: Verdict, recalibrates: bool) -> tuple[ExtrinsicsCorrection, ...]:
+        names = tuple(window.names[k] for k in verdict.cameras)
+        self._clock = names[0] if verdict.cause == "clock" else None
+        self._is_contradicted = bool(names) and verdict.cause != "clock"
+        self.widening = verdict.misfit if names else 1.0
+        self._n_undecided = self._n_undecided + 1 if names and verdict.cause is None else 0
+        self._note_undecided(names if self._n_undecided >= CONFIRMED else ())
+        if verdict.cause != "pose" or names[0] in self.pinned:
+            return ()
+        name, k = names[0], verdict.cameras[0]
+        changes = () if name in self.excluded else (ExtrinsicsCorrection(name, None),)
+        self.excluded.add(name)
+        placed = self._place(window, verdict.fit, k) if recalibrates else None
+        if placed is None:
+            return changes
+        self._use(name)
+        return (*changes, placed)
+
+    def _note_undecided(self, names: tuple[str, ...]) -> None:
+        """Log cameras that contradict each other when that begins, and when it ends."""
+        if names and not self.contradicting:
+            log.warning(
+                "cameras %s contradict each other, and the robots do not show which of them is at fault; all are used "
+                "as they are, and poses claim less; move robots through all views, or calibrate again",
+                ", ".join(names),
+            )
+        elif self.contradicting and not names:
+            log.info("cameras %s agree again", ", ".join(self.contradicting))
+        self.contradicting = names
+
+    def _place(self, window: Window, best: Fit, k: int) -> ExtrinsicsCorrection | None:
+        """The camera with the first of its known poses that explains the window, or else with that of the fit."""
+        name = window.names[k]
+        for other in window.names:
+            self._remember(other, self._cameras[other])
+        for pose in self._known[name]:
+            if pose == self._cameras[name].T_world_cam:
+                continue
+            T = window.T.copy()
+            T[k] = pose.matrix()
+            known = fit(replace(window, T=T), Hypothesis.of(None, (), len(window.names)))
+            if known.cost - best.cost < best.variance * chi2.isf(FALSE_ALARM, 6):
+                camera = msgspec.structs.replace(self._cameras[name], T_world_cam=pose)
+                return ExtrinsicsCorrection(name, camera, has_returned=True)
+        covariance = best.covariance(k)[:6, :6]
+        if (
+            np.sqrt(np.diag(covariance)[3:].max()) > MAX_SIGMA_M
+            or _sigma_px(window, best, covariance, k) > MAX_SIGMA_PX
+        ):
+            return None
+        pose = Pose.from_matrix(retract(window.T, best.errors)[k])
+        stated = tuple(map(tuple, covariance.tolist()))
+        camera = msgspec.structs.replace(self._cameras[name], T_world_cam=pose, covariance=stated)
+        return ExtrinsicsCorrection(name, camera)
+
+    def _remember(self, name: str, camera: Camera) -> None:
+        known = self._known.setdefault(name, [])
+        if camera.T_world_cam is not None and camera.T_world_cam not in known:
+            known.append(camera.T_world_cam)
+            del known[1 : 1 - MAX_KNOWN]  # never the calibration's: the others are less accurate
+
+    def _use(self, name: str) -> None:
+        self.excluded.discard(name)
+        self._keyframes.clear()
+        self._is_contradicted, self._n_undecided, self.widening = False, 0, 1.0
+        self._note_undecided(())
+
+
+def _done(job: Callable[[], tuple[Window, Verdict] | None]) -> "Future[tuple[Window, Verdict] | None]":
+    """The result of a job that runs at once."""
+    future: Future[tuple[Window, Verdict] | None] = Future()
+    future.set_result(job())
+    return future
+
+
+def judge_latest(
+    keyframes: Sequence[Keyframe],
+    cameras: CameraArray,
+    markers: MarkerTable,
+    densities: Array,
+    floor_px: float,
+) -> tuple[Window, Verdict] | None:
+    """Judge the longest window in which nothing changed; None without one."""
+    for n in WINDOWS:
+        if n <= len(keyframes):
+            window, starts = window_of(keyframes[-n:], cameras, markers, densities, floor_px)
+            verdict = judge(window, starts)
+            if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
+                return window, verdict
+    return None
+
+
+def _is_stationary(cost: Array) -> bool:
+    """Whether the mean costs (K,) of keyframes, in order of time, are alike in both halves."""
+    half = len(cost) // 2
+    before, after = np.nanmean(cost[:half]), np.nanmean(cost[half:])
+    return bool(max(before, after) < CHANGED * min(before, after) or max(before, after) < USUAL)
+
+
+def _sigma_px(window: Window, best: Fit, covariance: Array, k: int) -> float:
+    """RMS standard deviation, pixels, of the images of a camera's markers by the covariance (6, 6) of its pose."""
+    mine = np.flatnonzero(window.camera == k)
+    B, cov = best.by_camera[mine, :, :6], window.observations.detections.cov[:, :, mine]
+    variance = np.einsum("nai,ij,naj->n", B, covariance, B) / 2 * (cov[0, 0] + cov[1, 1]) / 2
+    return float(np.sqrt(variance.mean()))

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Derivatives by the errors of cameras, the elimination of robots, and which hypothesis is accepted."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from fusion import _core
+from fusion.rig_graph.hypotheses import CAUSES, ERRORS, Fit, Hypothesis, decide, retract
+from tests.fusion.native.scene import ARRAY, CAMERAS, scene
+
+STEP = 1e-6  # rad, m and s of a central difference quotient: an error of its square, and of rounding over it
+
+
+def expected_xy(errors: np.ndarray) -> np.ndarray:
+    """(2, N) centres that cameras with errors (C, 8) see of the scene."""
+    states, seen = scene()
+    exposures = seen.detections.exposures
+    T = retract(np.array([camera.matrix() for camera in CAMERAS.values()]), errors)
+    at = exposures.camera
+    R, centres = T[at, :3, :3].transpose(0, 2, 1), T[at, :3, 3]
+    tau = exposures.tau + errors[at, 6]
+    cameras = _core.CameraExposures(np.ascontiguousarray(R), centres.copy(), tau, np.zeros(len(at)))
+    return _core.FramePoses(states.bodies, cameras).views(seen.discs.columns)[9:]
+
+
+def derivatives(by_focal: np.ndarray | None = None) -> np.ndarray:
+    """(N, 2, 8) of the centres of the scene in undistorted coordinates."""
+    states, seen = scene()
+    whiten = np.ascontiguousarray(np.tile(np.eye(2)[:, :, None], len(seen)))
+    by_focal = np.zeros((2, len(seen))) if by_focal is None else by_focal
+    poses = ARRAY.frame_poses(states, seen.detections.exposures)
+    return poses.differentiate_by_camera(seen.discs.columns, whiten, by_focal)
+
+
+@pytest.mark.parametrize("column", range(7))
+def test_derivatives_by_camera_and_clock_are_those_of_difference_quotients(column: int):
+    error = np.zeros((len(CAMERAS), ERRORS))
+    error[:, column] = STEP
+    quotient = (expected_xy(error) - expected_xy(-error)) / (2 * STEP)
+    visible = np.isfinite(quotient[0])
+    found = derivatives()[visible, :, column].T
+    assert visible.sum() > 100
+    np.testing.assert_allclose(found, quotient[:, visible], rtol=1e-4, atol=1e-6 * np.abs(found).max())
+
+
+def test_derivatives_by_the_focal_length_are_those_given():
+    given = np.random.default_rng(3).normal(size=(2, len(scene()[1])))
+    found = derivatives(given)
+    visible = (found[:, :, :6] != 0).any((1, 2))
+    np.testing.assert_array_equal(found[visible, :, 7].T, given[:, visible])
+
+
+def test_derivatives_by_the_pose_are_those_of_gtsam_for_a_point():
+    states, seen = scene()
+    discs = replace(seen.discs, radius=np.full(len(seen), 1e-9))
+    views = ARRAY.views(states, seen.detections.exposures, discs)
+    whiten = np.ascontiguousarray(np.tile(np.eye(2)[:, :, None], len(seen)))
+    poses = ARRAY.frame_poses(states, seen.detections.exposures)
+    found = poses.differentiate_by_camera(discs.columns, whiten, np.zeros((2, len(seen))))
+    calibration, noise = gtsam.Cal3_S2(1.0, 1.0, 0.0, 0.0, 0.0), gtsam.noiseModel.Unit.Create(2)
+    rows = np.flatnonzero(np.isfinite(views.xy[0]))[::10]
+    for k in rows.tolist():
+        camera = CAMERAS[ARRAY.names[seen.detections.camera[k]]].matrix()
+        values = gtsam.Values()
+        values.insert(0, gtsam.Pose3(camera))
+        values.insert(1, gtsam.Point3(*(camera[:3, :3] @ views.centre[:, k] + camera[:3, 3])))
+        factor = gtsam.GenericProjectionFactorCal3_S2(gtsam.Point2(0.0, 0.0), noise, 0, 1, calibration)
+        jacobian, _ = factor.linearize(values).jacobian()
+        np.testing.assert_allclose(found[k, :, :6], jacobian[:, :6], rtol=1e-9, atol=1e-9)
+
+
+def test_elimination_gives_the_solution_of_the_whole_system():
+    rng = np.random.default_rng(5)
+    n, bodies, cameras = 300, 6, 3
+    D = rng.normal(size=(n, 2, 12 + ERRORS + 1))
+    weights, body, camera = rng.uniform(0.1, 1, n), rng.integers(0, bodies, n), rng.integers(0, cameras, n)
+    prior, right = rng.uniform(0.5, 2, (bodies, 12)), rng.normal(size=(bodies, 12))
+    size = 12 * bodies + ERRORS * cameras
+    A = np.zeros((n, 2, size))
+    for k in range(n):
+        A[k, :, 12 * body[k] : 12 * body[k] + 12] = D[k, :, :12]
+        first = 12 * bodies + ERRORS * camera[k]
+        A[k, :, first : first + ERRORS] = D[k, :, 12:-1]
+    H = np.einsum("n,nai,naj->ij", weights, A, A)
+    H[range(12 * bodies), range(12 * bodies)] += prior.ravel()
+    g = np.einsum("n,nai,na->i", weights, A, D[:, :, -1])
+    g[: 12 * bodies] += right.ravel()
+    whole = np.linalg.solve(H, g)
+    reduced, by_body = _core.eliminate_bodies(D, weights, body, camera, prior, right, cameras, 0.0)
+    step = np.linalg.solve(reduced[:, :-1], reduced[:, -1])
+    np.testing.assert_allclose(step, whole[12 * bodies :], rtol=1e-8, atol=1e-10)
+    of_bodies = by_body[:, :, -1] - by_body[:, :, :-1] @ step
+    np.testing.assert_allclose(of_bodies.ravel(), whole[: 12 * bodies], rtol=1e-8, atol=1e-10)
+
+
+def fitted(cause: str | None, cameras: tuple[int, ...], n_cameras: int, cost: float) -> Fit:
+    """A fit of 400 observations with this cost."""
+    hypothesis = Hypothesis.of(cause, cameras, n_cameras)  # pyright: ignore[reportArgumentType]
+    empty, n = np.zeros((0, 0)), n_cameras * ERRORS
+    return Fit(hypothesis, cost, np.zeros((n_cameras, ERRORS)), np.eye(n), empty, empty, np.full(400, 1.0))
+
+
+def test_the_camera_is_named_that_explains_more_than_every_other():
+    fits = [fitted(None, (), 3, 2000.0), fitted("pose", (0,), 3, 900.0), fitted("pose", (1,), 3, 400.0)]
+    verdict = decide(fits, 3)
+    assert (verdict.cause, verdict.cameras) == ("pose", (1,))
+
+
+@pytest.mark.parametrize("n_cameras", [2, 3, 4])
+def test_two_cameras_that_explain_the_same_are_both_named_and_nothing_is_decided(n_cameras: int):
+    fits = [fitted(None, (), n_cameras, 2000.0)]
+    fits += [fitted("pose", (k,), n_cameras, cost) for k, cost in ((0, 405.0), (1, 400.0))]
+    verdict = decide(fits, n_cameras)
+    assert (verdict.cause, verdict.cameras) == (None, (0, 1))
+
+
+def test_half_of_the_cameras_are_never_at_fault_against_the_others():
+    pair = [fitted("pose", (0, 1), 4, 400.0), fitted("pose", (2, 3), 4, 900.0)]
+    verdict = decide([fitted(None, (), 4, 2000.0), *pair], 4)
+    assert (verdict.cause, verdict.cameras) == (None, (0, 1))
+    assert decide([fitted(None, (), 2, 2000.0), fitted("pose", (0,), 2, 400.0)], 2).cause is None
+
+
+def test_more_free_cameras_are_no_rival_of_one_that_explains_as_much():
+    fits = [fitted(None, (), 6, 2000.0), fitted("pose", (4,), 6, 400.0), fitted("pose", (3, 4), 6, 398.0)]
+    assert decide(fits, 6).cameras == (4,)
+
+
+def test_errors_of_a_cause_are_free_and_no_others():
+    for cause, columns in CAUSES.items():
+        free = Hypothesis.of(cause, (1,), 3).free
+        assert free[1, columns].all()
+        assert free.sum() == len(range(*columns.indices(ERRORS)))
