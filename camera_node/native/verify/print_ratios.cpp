@@ -21,8 +21,11 @@ constexpr int kRecurring = 3;         // roundels of a kind in one frame
 constexpr int kMaxCount = 512;        // measurements that a regression remembers
 constexpr double kMinZoom = 0.05;     // relative change of the distance after which a roundel counts again
 constexpr double kContradiction = 3;  // standard deviations
-constexpr double kExact = 0.01;       // standard deviation, from which an assigned print may change
-constexpr double kReplaced = 0.15;    // distance at which a print that recurs replaces a usual one
+// Standard deviation of the ratio of a usual print: ink that spreads by 0.25 mm over both edges of 100 mm.
+constexpr double kDotGain = 0.008;
+constexpr double kSharper = 0.7;    // factor of the standard deviation at which an estimate replaces the last
+constexpr double kExact = 0.01;     // standard deviation, from which an assigned print may change
+constexpr double kReplaced = 0.15;  // distance at which a print that recurs replaces a usual one
 constexpr size_t kUsed = 256;
 const std::vector<Print> kUsual{{0.6}, {0.41}};
 
@@ -115,10 +118,15 @@ void PrintRatios::assign(Kind& kind) {
     if (kind.assigned && sigma > kExact) return;
     const Print& usual = nearest_print(kUsual, measured);
     const double curvature = kind.curvature_with(usual.ratio);
-    const bool contradicts = std::abs(usual.ratio - measured) > kContradiction * sigma ||
-                             curvature < kMinCurvature || curvature > kMaxCurvature;
-    const Print print = contradicts ? Print{measured, sigma} : usual;
-    if (!kind.assigned || std::abs(print.ratio - kind.assigned->ratio) > sigma) kind.assigned = print;
+    const double both = std::hypot(sigma, kDotGain), off = usual.ratio - measured;
+    const bool contradicts =
+        std::abs(off) > kContradiction * both || curvature < kMinCurvature || curvature > kMaxCurvature;
+    const Print print = contradicts ? Print{measured, sigma}
+                                    : Print{measured + off * square(sigma / both),
+                                            std::max(Print::kPaper, sigma * kDotGain / both)};
+    if (!kind.assigned || std::abs(print.ratio - kind.assigned->ratio) > print.sigma ||
+        print.sigma < kSharper * kind.assigned->sigma)
+        kind.assigned = print;
 }
 
 /// Collects the prints in use; returns whether they changed.
