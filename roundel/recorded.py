@@ -262,9 +262,9 @@ class Recording:
         """The rig, the robots and the limits of tracking."""
         context = ArenaRecording(faults=self.faults)
         if self.is_mcap:
-            for key, data, received_ns in read_messages(self.path, self.faults):
+            for key, data, _ in read_messages(self.path, self.faults):
                 if key.endswith(("/rig", "/robots", "/fusion/status")):
-                    context.add(key, data, received_ns)
+                    context.add(key, data)
             return context
         folder = self.path if self._is_folder else self.path.parent
         if (folder / "rig.yaml").is_file():

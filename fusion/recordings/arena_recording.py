@@ -13,8 +13,10 @@ import queue
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import zenoh
 
@@ -41,30 +43,83 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
 # For the answer of a busy server, also after the end of a recording: without the robots there is no replay.
 ANSWER_S = 10.0
 NO_ROBOTS = "no robot is declared: a replay of this recording needs --robots robots.yaml"
+DETECTIONS, POSE, FRAMES = "/detections", "/pose", "/fusion/frames"  # the ends of keys
+KINDS = {DETECTIONS: Detections, POSE: RobotPose, FRAMES: FusedFrames}
+T = TypeVar("T")
+
+
+class RecordedMessages(Generic[T]):
+    """Messages of one kind in a recording: each iteration reads the file, which may be larger than the memory.
+
+    Args:
+        path: of the file; None holds no messages.
+        suffix: of their keys.
+        kind: of the messages.
+        count: how many can be decoded.
+        convert: makes an item of the time of arrival (ns) and the message.
+    """
+
+    def __init__(
+        self, path: Path | None, suffix: str, kind: type, count: int, convert: Callable[[int, Any], T]
+    ) -> None:
+        self._path, self._suffix, self._kind, self._count = path, suffix, kind, count
+        self._convert = convert
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[T]:
+        for key, data, received_ns in read_messages(self._path, Counter()) if self._path else ():
+            if key.endswith(self._suffix):
+                with contextlib.suppress(MessageError):  # counted when the recording was read first
+                    yield self._convert(received_ns, decode(data, self._kind))
 
 
 @dataclass
 class ArenaRecording:
-    """The content of a recording: what cameras and server published, and when the detections arrived (ns)."""
+    """What a recording says of its arena, and its messages, which are read from the file when they are iterated."""
 
-    detections: list[tuple[int, Detections]] = field(default_factory=list)
-    poses: list[RobotPose] = field(default_factory=list)
-    frame_sets: list[FusedFrames] = field(default_factory=list)  # as the server formed them
+    path: Path | None = None
     limits: Limits | None = None  # of the server
     rig: Rig | None = None  # the first one
     robots: dict[str, Robot] = field(default_factory=dict)
     faults: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str] = field(
+        default_factory=Counter
+    )  # messages that can be decoded, by the end of their keys
 
-    def add(self, key: str, data: bytes, received_ns: int) -> None:
-        """Add a recorded message; count it if it can't be decoded."""
+    @property
+    def detections(self) -> RecordedMessages[tuple[int, Detections]]:
+        """When each message of a camera arrived (ns), and the message, in order of arrival."""
+        n = self.counts[DETECTIONS]
+        return RecordedMessages(self.path, DETECTIONS, Detections, n, lambda t_ns, message: (t_ns, message))
+
+    @property
+    def poses(self) -> RecordedMessages[RobotPose]:
+        """The poses that the server published."""
+        return RecordedMessages(self.path, POSE, RobotPose, self.counts[POSE], lambda _, pose: pose)
+
+    @property
+    def frame_sets(self) -> RecordedMessages[FusedFrames]:
+        """The frame sets as the server formed them."""
+        return RecordedMessages(self.path, FRAMES, FusedFrames, self.counts[FRAMES], lambda _, fused: fused)
+
+    def frames_and_sets(self) -> Iterator[tuple[int, Detections | FusedFrames]]:
+        """Messages of cameras and frame sets, each with its arrival (ns), in one pass over the file."""
+        for key, data, received_ns in read_messages(self.path, Counter()) if self.path else ():
+            for suffix in (DETECTIONS, FRAMES):
+                if key.endswith(suffix):
+                    with contextlib.suppress(MessageError):
+                        yield received_ns, decode(data, KINDS[suffix])
+
+    def add(self, key: str, data: bytes) -> None:
+        """Take a recorded message; count it, or the fault if it can't be decoded."""
         try:
-            if key.endswith("/detections"):
-                self.detections.append((received_ns, decode(data, Detections)))
-            elif key.endswith("/pose"):
-                self.poses.append(decode(data, RobotPose))
-            elif key.endswith("/fusion/frames"):
-                self.frame_sets.append(decode(data, FusedFrames))
-            elif key.endswith("/fusion/status"):
+            for suffix, kind in KINDS.items():
+                if key.endswith(suffix):
+                    decode(data, kind)
+                    self.counts[suffix] += 1
+            if key.endswith("/fusion/status"):
                 self.limits = decode(data, FusionStatus).limits
             elif key.endswith("/rig") and self.rig is None:
                 self.rig = decode(data, RigMessage).rig
@@ -75,14 +130,14 @@ class ArenaRecording:
 
 
 def read_recording(path: Path) -> ArenaRecording:
-    """Read a recording; of a truncated one, everything before its end.
+    """Read what a recording says of its arena, and count its messages; of a truncated one, everything before its end.
 
     Raises:
         ConfigError: the file is missing, or no recording of an arena.
     """
-    recording = ArenaRecording()
-    for key, data, received_ns in read_messages(path, recording.faults):
-        recording.add(key, data, received_ns)
+    recording = ArenaRecording(path)
+    for key, data, _ in read_messages(path, recording.faults):
+        recording.add(key, data)
     if not recording.detections:
         raise ConfigError(f"{path} holds no detections; record with roundel record {path}")
     return recording

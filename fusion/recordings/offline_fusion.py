@@ -6,7 +6,9 @@ depends on when they arrived at the server, and a recorder does not know that. W
 times of arrival.
 """
 
-from collections import Counter
+import heapq
+import os
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +18,7 @@ import numpy as np
 from calib.rig.camera import Camera
 from calib.rig.recording import RecordingWriter, as_they_arrived, read_messages
 from calib.rig.rig import load_rig
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, describe_failed_write
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.recorded_detections import detect_frames, read_observations
 from fusion.model.frames import CalibratedFrame, FrameSet
@@ -24,13 +26,15 @@ from fusion.model.limits import Limits
 from fusion.model.robots import Robot, load_robots
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.pose_messages import FusedFrames
-from fusion.recordings.arena_recording import ArenaRecording
+from fusion.recordings.arena_recording import DETECTIONS, ArenaRecording
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Refusal, admit
 from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult
 from fusion.tracking.smoothing import Smoother
 from fusion.tracking.tracker import Tracker
 
+Held = dict[tuple[str, int], Detections]  # by camera and stamp
+HELD_NS = 10_000_000_000
 STATES = ("tracked", "coasting", "lost")
 REFUSED: dict[Refusal, str] = {
     "unknown camera": "which has no pose in the rig",
@@ -213,11 +217,8 @@ def recorded_frame_sets(
         cameras: the placed ones, with the poses that the server used.
         faults: counts frames that the server used and the recording does not hold.
     """
-    messages: dict[tuple[str, int], Detections] = {}
-    for _, message in recording.detections:
-        messages.setdefault((message.camera, message.t_ns), message)  # the server refuses duplicates, too
     has_begun = False
-    for fused in recording.frame_sets:
+    for fused, messages in _with_their_frames(recording):
         frames = tuple(_frames(fused, messages, cameras))
         n_missing = len(fused.cameras) - len(frames)
         has_begun = has_begun or (len(frames) > 0 and not n_missing)
@@ -227,9 +228,34 @@ def recorded_frame_sets(
             yield FrameSet(fused.t_ns, frames)
 
 
-def _frames(
-    fused: FusedFrames, messages: dict[tuple[str, int], Detections], cameras: dict[str, Camera]
-) -> Iterator[CalibratedFrame]:
+def _with_their_frames(recording: ArenaRecording) -> Iterator[tuple[FusedFrames, "Held"]]:
+    """Each frame set, and the messages of cameras that arrived around it, by camera and stamp.
+
+    A frame set waits for its frames, and a frame for its frame set, `HELD_NS` at most: the recording may be larger than
+    the memory, and a recorder receives both within the limits of its own queue.
+    """
+    sets = deque[tuple[int, FusedFrames]]()
+    held: Held = {}
+    arrivals = deque[tuple[int, tuple[str, int]]]()
+    for received_ns, message in recording.frames_and_sets():
+        if isinstance(message, FusedFrames):
+            sets.append((received_ns, message))
+        elif (key := (message.camera, message.t_ns)) not in held:  # the server refuses duplicates, too
+            held[key] = message
+            arrivals.append((received_ns, key))
+        while sets and (sets[0][0] < received_ns - HELD_NS or _is_complete(sets[0][1], held)):
+            yield sets.popleft()[1], held
+        while arrivals and arrivals[0][0] < received_ns - 2 * HELD_NS:
+            held.pop(arrivals.popleft()[1])
+    for _, fused in sets:
+        yield fused, held
+
+
+def _is_complete(fused: FusedFrames, held: "Held") -> bool:
+    return all((name, stamp_ns) in held for name, stamp_ns, _, _ in fused.rows())
+
+
+def _frames(fused: FusedFrames, messages: "Held", cameras: dict[str, Camera]) -> Iterator[CalibratedFrame]:
     for name, stamp_ns, t_ns, clock_sigma_s in fused.rows():
         message = messages.get((name, stamp_ns))
         frame = None if message is None else admit(message, cameras)
@@ -262,13 +288,32 @@ def robots_of(recording: ArenaRecording, path: Path, robots: Path | None) -> dic
 
 
 def write_recording(source: Path, out: Path, fused: Iterable[TrackingResult]) -> None:
-    """Copy a recording with other poses and markers, which are logged at the times of their frame sets."""
-    entries = [e for e in read_messages(source, Counter()) if not e[0].endswith(("/pose", "/markers"))]
-    arena = next(key for key, _, _ in entries if key.endswith("/detections")).split("/")[0]
-    keys = Keys(arena)
+    """Copy a recording with other poses and markers, which are logged at the times of their frame sets.
+
+    Both are read while the copy is written, in the order of their times. A file at `out` is replaced at the end.
+
+    Raises:
+        ConfigError: the folder of `out` can't be written to, or the disk is full.
+    """
+    part = out.with_name(f".{out.name}.part")
+    old = (e for e in read_messages(source, Counter()) if not e[0].endswith(("/pose", "/markers")))
+    try:
+        with RecordingWriter(part) as writer:
+            for entry in heapq.merge(old, _entries(source, fused), key=lambda entry: entry[2]):
+                writer.put(*entry)
+        os.replace(part, out)
+    except OSError as error:
+        raise ConfigError(f"{out} can't be written: {describe_failed_write(error)}") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _entries(source: Path, fused: Iterable[TrackingResult]) -> Iterator[tuple[str, bytes, int]]:
+    """The recorded messages of poses and markers: key, bytes and time."""
+    keys = Keys(
+        next(key for key, _, _ in read_messages(source, Counter()) if key.endswith(DETECTIONS)).split("/")[0]
+    )
     for frame_set in fused:
-        entries += [(keys.robot_pose(pose.robot), encode(pose), frame_set.t_ns) for pose in frame_set.poses]
-        entries.append((keys.markers, encode(frame_set.markers), frame_set.t_ns))
-    with RecordingWriter(out) as writer:
-        for entry in sorted(entries, key=lambda entry: entry[2]):
-            writer.put(*entry)
+        for pose in frame_set.poses:
+            yield keys.robot_pose(pose.robot), encode(pose), frame_set.t_ns
+        yield keys.markers, encode(frame_set.markers), frame_set.t_ns

@@ -26,7 +26,7 @@ WAND = ROOT / "tests" / "data" / "wand"
 def test_all_of_a_recording():
     recording, held = Recording(SAMPLE), read_recording(SAMPLE)
     assert list(recording.detections()) == [message for _, message in held.detections]
-    assert list(recording.poses()) == held.poses
+    assert list(recording.poses()) == list(held.poses)
     assert recording.rig == held.rig
     assert recording.robots is not None
     assert recording.robots.robots == held.robots
