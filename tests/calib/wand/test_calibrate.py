@@ -114,6 +114,8 @@ def test_errors_name_the_fault():
     messages = record(arena, 3.0)
     symmetric = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), (0.5, 0.0, 0.0)))
     with pytest.raises(CalibrationError, match=r"symmetric.*0\.250 m.*0\.500 m"):
+        calibrate(arena.intrinsics, symmetric, record(ring(wand=symmetric), 3.0))
+    with pytest.raises(CalibrationError, match=r"the wand differs from its file: .*; the file has 0\.250 m"):
         calibrate(arena.intrinsics, symmetric, messages)
     with pytest.raises(CalibrationError, match="one camera, 'cam0'"):
         run(arena, [m for m in messages if m.camera == "cam0"])
