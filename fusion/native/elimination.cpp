@@ -10,7 +10,8 @@
 namespace roundel::fusion {
 namespace {
 
-/// The sums of one body: its block, and by column of the cameras its border; the last column is its right side.
+/// The sums of one body: its block, and by column of the cameras its border; the last column is its right
+/// side.
 struct BodyBlock {
     ErrorMatrix H{};
     std::vector<ErrorVector> border;

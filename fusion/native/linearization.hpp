@@ -31,9 +31,9 @@ struct CameraDerivatives {
     double B[2][kCameraErrors];
 };
 
-/// Writes the derivatives of N expected centres, times `whiten`. A rotation w and a translation t of the camera in
-/// its own frame move points in that frame by p x w - t; a clock offset delays the capture, in seconds;
-/// `by_focal` holds the derivatives by the logarithm of the focal length, undistorted coordinates.
+/// Writes the derivatives of N expected centres, times `whiten`. A rotation w and a translation t of the
+/// camera in its own frame move points in that frame by p x w - t; a clock offset delays the capture, in
+/// seconds; `by_focal` holds the derivatives by the logarithm of the focal length, undistorted coordinates.
 void differentiate(const FramePoses& poses, const Discs& discs, Columns<4> whiten, Columns<2> by_focal,
                    CameraDerivatives* to);
 

@@ -56,16 +56,20 @@ auto eliminate_bodies(const In<double, -1, 2, 21>& equations, const Numbers& wei
     const size_t n = weights.size(), n_bodies = information.shape(0);
     require_equal(n, {equations.shape(0), body.size(), camera.size()});
     require_equal(n_bodies, {right.shape(0)});
-    const JointSystem system{reinterpret_cast<const JointEquations*>(equations.data()), weights.data(),
-                             below(n_bodies, body), below(n_cameras, camera), n, n_bodies, n_cameras};
+    const JointSystem system{reinterpret_cast<const JointEquations*>(equations.data()),
+                             weights.data(),
+                             below(n_bodies, body),
+                             below(n_cameras, camera),
+                             n,
+                             n_bodies,
+                             n_cameras};
     const BodyPriors priors{reinterpret_cast<const ErrorVector*>(information.data()),
                             reinterpret_cast<const ErrorVector*>(right.data()), damping};
     const size_t d = kCameraErrors * n_cameras;
     auto [reduced, to_reduced] = make({d, d + 1});
     auto [by_body, to_body] = make({n_bodies, kErrors, d + 1});
-    unlocked([&, to_reduced = to_reduced, to_body = to_body] {
-        eliminate(system, priors, to_reduced, to_body);
-    });
+    unlocked(
+        [&, to_reduced = to_reduced, to_body = to_body] { eliminate(system, priors, to_reduced, to_body); });
     return std::make_tuple(reduced, by_body);
 }
 
