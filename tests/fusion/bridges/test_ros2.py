@@ -5,6 +5,7 @@ import contextlib
 import queue
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,15 +18,17 @@ from zenoh.ext import Int64, z_deserialize
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
+from camera_node.protocol.messages import ClockReply, Keys, encode
 from camera_node.protocol.session import listening_endpoints, open_router
 from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transforms
 from fusion.bridges.ros2_node import Ros2Node, ros_name
 from fusion.client.arena import Arena
 from fusion.commands.bridges.ros2 import ros2
+from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import RobotPose
 from tests.conftest import free_port
-from tests.fusion.bridges.pose_server import PoseServer, publish_poses, restart
+from tests.fusion.bridges.pose_server import PoseServer, publish_poses, restart, status
 from tests.processes import killed_at_end, run_program
 from tests.waiting import DEADLINE_S, repeating
 
@@ -153,9 +156,23 @@ def bridging(endpoint: str, *options: str) -> contextlib.AbstractContextManager[
     return killed_at_end(command, stderr=subprocess.PIPE, text=True)
 
 
-def publishing(session: zenoh.Session, poses: list[RobotPose]) -> contextlib.AbstractContextManager[None]:
-    """Publish the poses repeatedly, as a server does."""
-    return repeating(lambda: publish_poses(session, poses), 0.05)
+@contextlib.contextmanager
+def publishing(session: zenoh.Session, poses: list[RobotPose]) -> Iterator[None]:
+    """Publish the poses repeatedly, of the present time, and answer with that time, as a server does."""
+    keys, patient = Keys("test"), Limits(lateness_ms=1e3 * DEADLINE_S)
+
+    def publish() -> None:
+        t_ns = time.time_ns()
+        session.put(keys.fusion_status, encode(status(t_ns, patient)))
+        publish_poses(session, [msgspec.structs.replace(pose, t_ns=t_ns) for pose in poses])
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(query.key_expr, encode(ClockReply(t_ns=time.time_ns())))
+
+    clock = session.declare_queryable(keys.clock, answer)
+    with repeating(publish, 0.05):
+        yield
+    clock.undeclare()
 
 
 @pytest.mark.parametrize("humble", [False, True])
