@@ -106,6 +106,7 @@ class VirtualArena:
         return self
 
     def __exit__(self, *exception: object) -> None:
+        self.server.__exit__()
         logging.getLogger("fusion").removeHandler(self._log)
 
     def wait(self, seconds: float) -> None:
@@ -148,6 +149,7 @@ class VirtualArena:
 
     def restart(self) -> None:
         """Replace the server by one that knows only its files."""
+        self.server.__exit__()
         self.server = self._server()
 
     def _server(self) -> Server:
