@@ -68,7 +68,7 @@ def test_every_command_has_a_test():
         *("python3 -m venv ~/roundel", "~/roundel/bin/pip install"),  # test_packaging.py
         "~/roundel/bin/roundel demo",  # test_demo.py
         *("roundel print", "roundel detect", "roundel simulate", "roundel calibrate"),
-        *("roundel up", "roundel camera", "roundel define", "roundel run"),
+        *("roundel up", "roundel camera", "roundel define", "roundel run", "roundel verify"),
     )
     assert [command for command in OWN if not command.startswith(tested)] == []
 
