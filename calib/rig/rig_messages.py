@@ -8,7 +8,7 @@ its first line, so that a numbered version takes it along. Messages are encoded 
 import hashlib
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -25,6 +25,7 @@ MAX_NAMED = 3  # cameras whose motion is named
 MAX_CHANGE = 1000  # characters of the text of a change
 MARK = "# changed: "
 MAX_LINE = 4096  # bytes of a first line
+Change = TypeVar("Change", bound="RigChange")
 RIGID_M = 1e-4  # that a common motion of all cameras leaves, at most
 MAX_VERSIONS = 64  # in one history
 MAX_RIG_BYTES = 1 << 20  # of a message; 256 cameras with their reports take a quarter
@@ -56,15 +57,18 @@ def read_change(path: Path) -> RigChange:
     Raises:
         OSError: the file can't be read.
     """
+    return _read_first_line(path, RigChange) or RigChange(t_ns=path.stat().st_mtime_ns)
+
+
+def _read_first_line(path: Path, kind: type[Change]) -> Change | None:
+    """What the first line of a saved file says; None without such a line. Raises OSError."""
     with path.open("rb") as file:
         line = file.readline(MAX_LINE)
     mark = MARK.encode()
-    if line.startswith(mark):
-        try:
-            return msgspec.json.decode(line[len(mark) :], type=RigChange)
-        except (msgspec.MsgspecError, ValueError):  # edited by hand
-            pass
-    return RigChange(t_ns=path.stat().st_mtime_ns)
+    try:
+        return msgspec.json.decode(line[len(mark) :], type=kind) if line.startswith(mark) else None
+    except (msgspec.MsgspecError, ValueError):  # edited by hand
+        return None
 
 
 class SavedChange(RigChange, frozen=True, kw_only=True, omit_defaults=True):
@@ -88,11 +92,15 @@ def file_digest(path: Path | None) -> str:
 def read_given(path: Path) -> str | None:
     """The digest in the first line of a file that a server saved; None if there is none, as of older versions."""
     try:
-        with path.open("rb") as file:
-            line = file.readline(MAX_LINE)
-        return msgspec.json.decode(line.removeprefix(MARK.encode()), type=SavedChange).given or None
-    except (OSError, msgspec.MsgspecError, ValueError):
+        saved = _read_first_line(path, SavedChange)
+    except OSError:
         return None
+    return (saved and saved.given) or None
+
+
+def without_change(text: str) -> str:
+    """The text of a saved file without the line that says what changed."""
+    return text.partition("\n")[2] if text.startswith(MARK) else text
 
 
 def holds_rig(path: Path, rig: Rig) -> bool:
@@ -101,7 +109,7 @@ def holds_rig(path: Path, rig: Rig) -> bool:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return False
-    return (text.partition("\n")[2] if text.startswith(MARK) else text) == dump_rig(rig)
+    return without_change(text) == dump_rig(rig)
 
 
 def describe_change(before: Rig | None, after: Rig) -> str:

@@ -149,7 +149,7 @@ class Arena:
         return self.time.read().age_s(message.t_ns, time.monotonic())
 
     def why_no_poses(self, robot: str | None = None) -> str:
-        """The cause why no pose arrives, of a robot or of any, in one sentence with what to do. It asks nobody.
+        """The cause why no pose arrives, of a robot or of any, in one sentence with what to do. It sends no request.
 
         The server is away, the arena has another name, no camera sends frames, none is calibrated, the robot is not
         declared or not seen; it names the arenas and robots that are there.

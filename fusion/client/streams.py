@@ -148,15 +148,7 @@ class Stream(Generic[T]):
 class RobotStream(Stream[RobotPose]):
     """The poses of one robot."""
 
-    def __init__(
-        self,
-        content: str,
-        timeout_s: float | None,
-        cause: Callable[[], str],
-        age: Callable[[RobotPose, float], float] = since_arrival,
-    ) -> None:
-        super().__init__(content, timeout_s, cause, age)
-        self._located: tuple[RobotPose, float] | None = None  # the newest pose that is not of a lost robot
+    _located: tuple[RobotPose, float] | None = None  # the newest pose that is not of a lost robot
 
     def latest(self, max_age_s: float | None = None) -> RobotPose | None:
         """The newest pose, or None before the first; with `max_age_s`, None also if it is older or the robot lost.

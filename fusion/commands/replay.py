@@ -46,8 +46,8 @@ def replay(
     cameras, declared = cameras_of(recorded, recording, rig), robots_of(recorded, recording, robots)
     arena = OfflineArena(cameras, declared, rate_hz, recorded.limits or Limits(), smooth)
     summary = Summary(faults=recorded.faults)
-    is_anew = rig is not None or rate_hz is not None
-    fused = track(fuse_again(recorded, arena, summary, is_anew), "fusing")
+    forms_sets = rig is not None or rate_hz is not None
+    fused = track(fuse_again(recorded, arena, summary, forms_sets), "fusing")
     if out.suffix == ".mcap":
         write_recording(recording, out, fused)
     else:

@@ -107,7 +107,7 @@ class Verify:
         recorded = read_recording(self.recording)
         cameras = cameras_of(recorded, self.recording, self.rig)
         arena = OfflineArena(cameras, recorded.robots, limits=recorded.limits or Limits())
-        fused = fuse_again(recorded, arena, summary, anew=self.rig is not None)
+        fused = fuse_again(recorded, arena, summary, forms_sets=self.rig is not None)
         summary.faults.update(recorded.faults)
         return cameras, (result.markers for result in fused)
 

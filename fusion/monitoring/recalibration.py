@@ -7,6 +7,7 @@
 The other cameras, and with them the world frame, do not change.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import msgspec
@@ -45,7 +46,9 @@ def recalibrate(camera: Camera, views: list[ExpectedFrame]) -> Camera | None:
     """
     points = np.concatenate([view.points for view in views], axis=1).T
     of_view = np.repeat(np.arange(len(views)), [view.points.shape[1] for view in views])
-    T, shift, residual_px, covariance = camera.matrix(), _image_shift(camera, views), np.inf, np.eye(6)
+    expected = (camera.project_world(view.points.T) for view in views)
+    shift = image_shift(expected, (view.frame.roundels.uv for view in views))
+    T, residual_px, covariance = camera.matrix(), np.inf, np.eye(6)
     for gate in GATES_PX:
         uv = _with_pose(camera, T).project_world(points) + shift
         rows, measured = _correspondences(views, uv, of_view, gate)
@@ -74,15 +77,16 @@ def _with_pose(camera: Camera, T: Array) -> Camera:
     return msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
 
 
-def _image_shift(camera: Camera, views: list[ExpectedFrame]) -> Array:
-    """(2,) the image shift on which most pairs of expected and detected roundels agree, pixels."""
+def image_shift(expected: Iterable[Array], detected: Iterable[Array]) -> Array:
+    """(2,) the image shift on which most pairs of expected and detected roundels agree, pixels.
+
+    Args:
+        expected, detected: (N, 2) and (M, 2) of each frame of a camera, pixels.
+    """
     size = int(SEARCH_PX / BIN_PX)
     votes = np.zeros((2 * size + 1, 2 * size + 1))
-    shifts = []
-    for view in views:
-        off = view.frame.roundels.uv[None] - camera.project_world(view.points.T)[:, None]
-        shifts.append(off.reshape(-1, 2))
-    off = np.concatenate(shifts)
+    pairs = zip(expected, detected, strict=True)
+    off = np.concatenate([(there[None] - uv[:, None]).reshape(-1, 2) for uv, there in pairs])
     off = off[(np.abs(off) < SEARCH_PX).all(1)]
     np.add.at(votes, tuple(np.round(off / BIN_PX).astype(int).T + size), 1)
     smooth = sum(np.roll(votes, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))

@@ -253,7 +253,7 @@ class ArenaRecorder:
                 is_first, self.robots = self.robots is None, frozenset(decode(data, Robots).robots)
                 if is_first and not self.robots:
                     log.warning(
-                        "arena %s: %s; robots that are declared meanwhile are recorded",
+                        "arena %s: %s; robots that are declared later are recorded",
                         self._arena,
                         NO_ROBOTS,
                     )

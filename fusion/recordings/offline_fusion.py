@@ -132,10 +132,11 @@ def fuse_recording(
 
 
 def fuse_again(
-    recording: ArenaRecording, arena: OfflineArena, summary: Summary, anew: bool
+    recording: ArenaRecording, arena: OfflineArena, summary: Summary, forms_sets: bool
 ) -> Iterator[TrackingResult]:
-    """Fuse a recording: the server's frame sets, or those that are formed `anew` or because it holds none."""
-    if anew or not recording.frame_sets:
+    """Fuse a recording: the server's frame sets, or, with `forms_sets` or if it holds none, those that its
+    detections form by their times of arrival."""
+    if forms_sets or not recording.frame_sets:
         return fuse_recording(recording.detections, arena, summary)
     return fuse_frame_sets(recorded_frame_sets(recording, arena.cameras, summary.faults), arena, summary)
 

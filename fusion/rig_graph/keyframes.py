@@ -28,15 +28,12 @@ from fusion.model.observations import (
 from fusion.model.states import States
 from fusion.monitoring.clocks.time_search import Snapshot
 from fusion.monitoring.expected_views import ExpectedViews
+from fusion.monitoring.recalibration import image_shift
 from fusion.rig_graph.hypotheses import ERRORS, Window
 
 INTERVAL_NS = 90_000_000  # between keyframes: a tenth of a second, at 30 frame sets a second too
 HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its robots
 MAX_ROBOTS = 4  # of a keyframe; the next one has others
-SEARCH_PX, BIN_PX = (
-    120.0,
-    6.0,
-)  # largest image shift: 8 degrees at a focal length of 840 px; resolution of the search
 # Between expected and detected markers: robots that follow a camera at fault are expected pixels away, and discs of
 # other markers are at least their own diameter away.
 GATES_PX = (16.0, 10.0, 8.0, 8.0)
@@ -194,7 +191,8 @@ def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tupl
 def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tuple[Index, Index]]]:
     """The same for views that show their markers elsewhere."""
     T, matches = camera.matrix(), [(np.empty(0, np.intp), np.empty(0, np.intp)) for _ in views]
-    shift, points = _image_shift(views), np.concatenate([view.points for view in views], axis=1).T
+    shift = image_shift((view.uv for view in views), (view.frame.roundels.uv for view in views))
+    points = np.concatenate([view.points for view in views], axis=1).T
     of_view = np.cumsum([len(view.rows) for view in views])[:-1]
     for gate in GATES_PX:
         moved = msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
@@ -207,19 +205,6 @@ def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, lis
         T = _fit_pose(camera, T, shown, np.concatenate([v.frame.roundels.uv[d] for v, (_, d) in pairs]))
         shift = np.zeros(2)
     return T, matches
-
-
-def _image_shift(views: Sequence[FrameView]) -> Array:
-    """(2,) the image shift on which most pairs of expected and detected roundels agree, pixels."""
-    size = int(SEARCH_PX / BIN_PX)
-    votes = np.zeros((2 * size + 1, 2 * size + 1))
-    off = np.concatenate([(v.frame.roundels.uv[None] - v.uv[:, None]).reshape(-1, 2) for v in views])
-    off = off[(np.abs(off) < SEARCH_PX).all(1)]
-    np.add.at(votes, tuple(np.round(off / BIN_PX).astype(int).T + size), 1)
-    smooth = sum(np.roll(votes, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))
-    best = (np.array(np.unravel_index(np.argmax(smooth), votes.shape)) - size) * BIN_PX
-    near = off[np.linalg.norm(off - best, axis=1) < 2 * BIN_PX]
-    return np.median(near, axis=0) if len(near) else np.zeros(2)
 
 
 def _nearest(expected: Array, seen: Array, gate_px: float) -> tuple[Index, Index]:

@@ -337,7 +337,7 @@ def error_px(arena: VirtualArena, name: str) -> float:
 
 
 def judged(lines: Sequence[str], guilty: Collection[str]) -> str:
-    """Who was reported: only the guilty, nobody, several that contradict each other, or somebody innocent."""
+    """Who was reported: only cameras at fault, none, several that contradict each other, or an innocent one."""
     definite = [line for line in lines if UNDECIDED not in line]
     subjects = {line.split()[1].rstrip(":") for line in definite if line.startswith(("camera ", "robot "))}
     if subjects - set(guilty):

@@ -17,7 +17,6 @@ from calib.rig.camera import Camera
 from calib.rig.file_history import History
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from calib.rig.rig_messages import (
-    MARK,
     MAX_CHANGE,
     MAX_VERSIONS,
     RigHistory,
@@ -29,6 +28,7 @@ from calib.rig.rig_messages import (
     holds_rig,
     read_change,
     read_given,
+    without_change,
 )
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError, RoundelError
@@ -244,8 +244,7 @@ class ActiveRig:
             return
         with contextlib.suppress(RoundelError, OSError):  # a folder that can't be written to: as it was
             change = msgspec.structs.asdict(read_change(path))
-            text = path.read_text(encoding="utf-8")
-            body = text.partition("\n")[2] if text.startswith(MARK) else text
+            body = without_change(path.read_text(encoding="utf-8"))
             write_atomically(path, SavedChange(**change, given=self._digest).line() + body)
 
     def _save_active(self) -> None:

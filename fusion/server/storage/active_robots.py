@@ -58,7 +58,7 @@ class ActiveRobots:
     def change(self, request: RobotsRequest) -> bool:
         """Rename, remove and define robots, all or none, and save them; return whether that changes anything.
 
-        What a user edited in the saved file meanwhile comes first: nothing of it is overwritten.
+        What a user edited in the saved file since it was read comes first: nothing of it is overwritten.
 
         Raises:
             ConfigError, FusionError: the request is invalid, or the file was edited and is broken.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A pose has an age: it grows while the server is dead, and no one is told that a robot is tracked then."""
+"""A pose has an age: it grows while the server is dead, and then no client calls a robot tracked."""
 
 import math
 
@@ -44,9 +44,7 @@ def test_the_age_is_in_the_server_s_time(ahead_s: int):
         Arena(ServerConnection((endpoint,)), ARENA) as arena,
     ):
         rover = arena.robot("rover")
-        wait_for(
-            lambda: rover.latest(3.0)
-        )  # two readings of 5 s apart are told apart on a busy machine as well
+        wait_for(lambda: rover.latest(3.0))  # two readings of 5 s apart differ on a busy machine as well
         assert rover.age_s() >= 0.0
         late = moving_pose("rover", server.now_ns() - 10**10)
         assert arena.age_s(late) > 9.0

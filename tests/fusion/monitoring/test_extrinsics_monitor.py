@@ -1,36 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A moved camera is found, excluded and recalibrated; the world frame does not change."""
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 import pytest
 
-from camera_node.geometry.pose import Pose, rotation_from_vector
-from fusion.model.frames import CalibratedFrame
+from camera_node.geometry.pose import rotation_from_vector
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
-from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
+from tests.fusion.moved_camera import MOTIONS, MOVE_S, ROBOTS, black, moved
+from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena
 from tests.fusion.tracks import errors
-
-MOVE_S = 0.7
-ROBOTS = {"a": TRIANGLE, "b": WIDE}
-MOTIONS = {
-    "a": line((-0.5, 0.3, 0.15), (0.25, -0.1, 0), turn=(0, 0, 0.5)),
-    "b": line((0.5, -0.3, 0.5), (-0.2, 0.15, 0), turn=(0, 0, -0.4)),
-}
-
-
-def moved(turn_deg: float, shift_m: float) -> tuple[Arena, Arena]:
-    """An arena, and the same with cam1 rotated and shifted along axes that are not parallel to a coordinate axis."""
-    before = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
-    T = before.cameras["cam1"].matrix()
-    T[:3, :3] = T[:3, :3] @ rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.64, 0.48]))
-    T[:3, 3] += shift_m * np.array([0.48, -0.6, 0.64])
-    cameras = dict(before.cameras)
-    cameras["cam1"] = msgspec.structs.replace(cameras["cam1"], T_world_cam=Pose.from_matrix(T))
-    return before, Arena(ROBOTS, MOTIONS, cameras=cameras, sigma_px=0.1)
 
 
 @pytest.mark.parametrize(
@@ -95,14 +75,6 @@ def test_a_misplaced_marker_is_reported_of_its_robot_and_not_of_a_camera(off_m, 
     assert corrections == []
     assert (list(tracker.geometry.misfits()) == ["a"]) == reported
     assert ("robot a" in caplog.text) == reported
-
-
-def black(frame: CalibratedFrame) -> CalibratedFrame:
-    """The frame without what it shows."""
-    empty = np.empty(0, np.intp)
-    return replace(
-        frame, roundels=frame.roundels.select(empty), xy=frame.xy[:, empty], scale=frame.scale[..., empty]
-    )
 
 
 def test_a_correct_camera_is_not_excluded(run_arena):

@@ -1,40 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A moved camera is found, excluded and recalibrated; the world frame does not change."""
 
-from dataclasses import replace
-
-import msgspec
 import numpy as np
 import pytest
 
-from camera_node.geometry.pose import Pose, rotation_from_vector
-from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.frames import FrameSet
 from fusion.monitoring.clocks.time_search import Snapshot
 from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.pose_messages import RobotPose
 from fusion.rig_graph.rig_monitor import RigMonitor
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
-from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, line
+from tests.fusion.moved_camera import MOTIONS, MOVE_S, ROBOTS, black, moved
+from tests.fusion.synthetic import PERIOD_NS, Arena
 from tests.fusion.tracks import errors
-
-MOVE_S = 0.7
-ROBOTS = {"a": TRIANGLE, "b": WIDE}
-MOTIONS = {
-    "a": line((-0.5, 0.3, 0.15), (0.25, -0.1, 0), turn=(0, 0, 0.5)),
-    "b": line((0.5, -0.3, 0.5), (-0.2, 0.15, 0), turn=(0, 0, -0.4)),
-}
-
-
-def moved(turn_deg: float, shift_m: float) -> tuple[Arena, Arena]:
-    """An arena, and the same with cam1 rotated and shifted along axes that are not parallel to a coordinate axis."""
-    before = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
-    T = before.cameras["cam1"].matrix()
-    T[:3, :3] = T[:3, :3] @ rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.64, 0.48]))
-    T[:3, 3] += shift_m * np.array([0.48, -0.6, 0.64])
-    cameras = dict(before.cameras)
-    cameras["cam1"] = msgspec.structs.replace(cameras["cam1"], T_world_cam=Pose.from_matrix(T))
-    return before, Arena(ROBOTS, MOTIONS, cameras=cameras, sigma_px=0.1)
 
 
 class JudgedTracker:
@@ -90,14 +69,6 @@ def test_a_moved_camera_is_excluded_within_a_second_and_recalibrated(turn_deg, s
         mine = [pose for pose in poses if pose.robot == robot][3:]
         assert all(pose.state == "tracked" for pose in mine)
         assert np.linalg.norm(errors(before, mine)[:, 3:], axis=1).max() < 2e-3
-
-
-def black(frame: CalibratedFrame) -> CalibratedFrame:
-    """The frame without what it shows."""
-    empty = np.empty(0, np.intp)
-    return replace(
-        frame, roundels=frame.roundels.select(empty), xy=frame.xy[:, empty], scale=frame.scale[..., empty]
-    )
 
 
 def test_a_correct_camera_is_not_excluded():

@@ -13,7 +13,7 @@ FAULT = "connections beyond the limit of one address"
 
 
 def test_silent_sessions_of_one_client_are_ended_by_the_server(tmp_path: Path):
-    """They keep nobody out; the connection of another address stays."""
+    """They exclude no other machine: the connection of another address stays."""
     with serving(config(tmp_path)) as (server, client), contextlib.ExitStack() as stack:
         endpoint = f"{server.endpoints[0]}#bind=127.0.0.3:0"
         for _ in range(MAX_OF_ADDRESS + 5):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A camera that was renamed or forgotten disappears from the status; one that is silent stays. A state that
-lasts is told once."""
+lasts is logged once."""
 
 import logging
 

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""An arena of which one camera is moved, and frames that turn black: for the tests of what judges cameras."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from camera_node.geometry.pose import Pose, rotation_from_vector
+from fusion.model.frames import CalibratedFrame
+from tests.fusion.synthetic import TRIANGLE, WIDE, Arena, line
+
+MOVE_S = 0.7
+ROBOTS = {"a": TRIANGLE, "b": WIDE}
+MOTIONS = {
+    "a": line((-0.5, 0.3, 0.15), (0.25, -0.1, 0), turn=(0, 0, 0.5)),
+    "b": line((0.5, -0.3, 0.5), (-0.2, 0.15, 0), turn=(0, 0, -0.4)),
+}
+
+
+def moved(turn_deg: float, shift_m: float) -> tuple[Arena, Arena]:
+    """An arena, and the same with cam1 rotated and shifted along axes that are not parallel to a coordinate axis."""
+    before = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
+    T = before.cameras["cam1"].matrix()
+    T[:3, :3] = T[:3, :3] @ rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.64, 0.48]))
+    T[:3, 3] += shift_m * np.array([0.48, -0.6, 0.64])
+    cameras = dict(before.cameras)
+    cameras["cam1"] = msgspec.structs.replace(cameras["cam1"], T_world_cam=Pose.from_matrix(T))
+    return before, Arena(ROBOTS, MOTIONS, cameras=cameras, sigma_px=0.1)
+
+
+def black(frame: CalibratedFrame) -> CalibratedFrame:
+    """The frame without what it shows."""
+    empty = np.empty(0, np.intp)
+    return replace(
+        frame, roundels=frame.roundels.select(empty), xy=frame.xy[:, empty], scale=frame.scale[..., empty]
+    )
