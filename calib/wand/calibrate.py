@@ -55,6 +55,7 @@ from calib.wand.quality.checks import (
     find_exchanges,
     triangulated_residuals,
 )
+from calib.wand.recording_checks import check_cameras, check_inside, check_recording
 from calib.wand.scale import Distance
 from calib.wand.trajectory import acceleration_density
 from calib.wand.wand_report import NOT_RECORDED, Exchange, WandCalibration
@@ -104,6 +105,7 @@ def calibrate(
     """
     check_recording(rig, messages)
     check_cameras(rig, background, "the background points")
+    check_inside(rig, background, "background points")
     check_diameter(wand, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
@@ -137,31 +139,6 @@ def _calibrate(
     placement = replace(placement, unplaced=placement.unplaced | absent, timing=timing)
     jump = find_jump(placement.recording.names, solution.adjusted, solution.observations)
     return conclude(rig, solution, placement, jump)
-
-
-def check_recording(rig: Rig, messages: Sequence[Detections]) -> None:
-    """Raise CalibrationError if a recording does not fit the rig, or has fewer than two cameras."""
-    sizes = {message.camera: (message.width, message.height) for message in messages}
-    check_cameras(rig, messages, "the recording")
-    if len(sizes) < 2:
-        only = f"one camera, '{next(iter(sizes))}'" if sizes else "no camera"
-        raise CalibrationError(f"the recording has {only}; a wand calibration needs two or more")
-    for name, (width, height) in sizes.items():
-        lens = rig.cameras[name]
-        if (width, height) != (lens.width, lens.height):
-            raise CalibrationError(
-                f"camera '{name}' delivers {width} x {height} pixels, its intrinsics are for "
-                f"{lens.width} x {lens.height}; record at that size or calibrate the lens again"
-            )
-
-
-def check_cameras(rig: Rig, messages: Sequence[Detections], of: str) -> None:
-    """Raise CalibrationError if messages come from a camera that is not in the rig."""
-    if unknown := sorted({message.camera for message in messages} - set(rig.cameras)):
-        raise CalibrationError(
-            f"camera '{unknown[0]}' of {of} is not in the rig, which has "
-            f"{', '.join(sorted(rig.cameras))}; run roundel calibrate intrinsics --camera {unknown[0]}"
-        )
 
 
 def _explain_no_wand(recording: WandRecording) -> str:

@@ -19,13 +19,14 @@ from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.optimizer import adjust, optimize_robustly
 from calib.wand.bundle_adjustment.problem import Adjusted, Estimate, WandObservations
 from calib.wand.bundle_adjustment.problem_setup import build_problem
-from calib.wand.calibrate import check_agreement, check_recording
+from calib.wand.calibrate import check_agreement
 from calib.wand.clock_model import with_readout_times
 from calib.wand.conclusion import Solution, adjusted_camera, clock_values
 from calib.wand.detections import WandRecording
 from calib.wand.initial_rig import TwoViewGeometry
 from calib.wand.labels import label_recording
 from calib.wand.quality.checks import check_lenses
+from calib.wand.recording_checks import check_recording
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
