@@ -184,16 +184,15 @@ def track(
         for pose in track("recording", "rig.yaml", "robots.yaml"):
             print(pose.t_ns, pose.robot, pose.position)
 
-    Without `rig` and `rate_hz`, the poses of a recorded server are repeated exactly, and its detections are held in
-    memory. Otherwise frame sets are formed from the times of arrival, one after the other. What is skipped is
-    logged as a warning at the end.
+    Without `rig` and `rate_hz`, the poses of a recorded server are repeated exactly. Otherwise frame sets are formed
+    from the times of arrival. What is skipped is logged as a warning at the end.
 
     Args:
         recording: a file or folder, see `Recording`.
         rig: the placed cameras; those of the recording unless given.
         robots: the declared robots; those of the recording unless given.
-        smooth: estimate each pose from the whole recording, not only from the frames before it; the recording's states
-            are then held in memory.
+        smooth: estimate each pose from later frames, too, not only from those before it; a few seconds are held in
+            memory.
         rate_hz: poses a second; without it the rate of the fastest camera.
 
     Returns:

@@ -29,7 +29,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Data
 
 from camera_node.foundation.config import load_yaml
-from camera_node.foundation.errors import ConfigError, printable
+from camera_node.foundation.errors import ConfigError, printable, unwritable
 from web.errors import WebError
 
 log = logging.getLogger("web.page")
@@ -93,7 +93,7 @@ def _create_private(path: Path, data: bytes) -> None:
     except FileExistsError:
         raise
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}; does its folder exist?") from None
+        raise unwritable(path, error) from None
 
 
 class Refusal(Exception):

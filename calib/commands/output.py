@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib.live.rig_requests import set_rig
 from calib.rig.rig import Rig, save_rig
-from camera_node.foundation.errors import ConfigError, NetworkError
+from camera_node.foundation.errors import ConfigError, NetworkError, unwritable
 from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestError
 from camera_node.protocol.server_connection import Connection
@@ -46,7 +46,7 @@ def save_image(path: Path, image: NDArray[np.uint8]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}") from None
+        raise unwritable(path, error) from None
 
 
 def provenance() -> dict[str, Any]:

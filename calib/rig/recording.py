@@ -19,7 +19,7 @@ from calib.rig.camera import Camera
 from calib.rig.file_history import History
 from calib.rig.recording_reader import PROFILE, ReadLimits, RecordingReader
 from calib.rig.recording_repair import repair_recording
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
 LOG = logging.getLogger("calib")
@@ -55,7 +55,7 @@ class RecordingWriter:
         except FileExistsError:
             raise ConfigError(f"{self.path} exists; give another name, or --force to replace it") from None
         except OSError as error:
-            raise ConfigError(f"{self.path} can't be written: {error.strerror}; check its folder") from None
+            raise unwritable(self.path, error) from None
         # An index of each channel in each chunk would take up to 0.1 kB of memory for each of them until the end.
         self._writer = Writer(self._file, chunk_size=MAX_CHUNK, index_types=IndexType.CHUNK)
         self._writer.start(profile=PROFILE, library="roundel")
@@ -160,7 +160,7 @@ def save_wand_recording(path: Path, arena: str, messages: Iterable[Detections]) 
         backup = History(path).back_up()
         os.replace(part, path)
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}") from None
+        raise unwritable(path, error) from None
     finally:
         part.unlink(missing_ok=True)
     return backup

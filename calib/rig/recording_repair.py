@@ -125,7 +125,8 @@ def _read_content(file: IO[bytes], reader: RecordingReader) -> _Content:
             content.counts += counts
             if part.chunk is not None:
                 content.is_sound &= part.opcode == Opcode.CHUNK
-                content.chunks.append(_IndexedChunk(_chunk_index(part, times), part, counts))
+                place = part._replace(records=b"")  # a recording may be larger than the memory
+                content.chunks.append(_IndexedChunk(_chunk_index(part, times), place, counts))
         if part.opcode != Opcode.DATA_END:
             content.end = part.end
     return content

@@ -116,8 +116,8 @@ def gather(
 ) -> tuple[FrameTable, WandDetections]:
     """Collect the detections of the cameras `names` from their messages.
 
-    The `id` of a roundel becomes its label. Detections outside the image, or outside the valid area of a lens model, are
-    dropped.
+    The `id` of a roundel becomes its label. Detections outside the image, or outside the valid area of a lens model,
+    are dropped.
     """
     index = {name: k for k, name in enumerate(names)}
     messages = sorted(messages, key=lambda message: (index[message.camera], message.t_ns))

@@ -10,7 +10,7 @@ import tyro
 from zenoh import Session
 
 from camera_node.foundation.config import require_name
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.foundation.terminal import say
 from camera_node.protocol.camera_requests import (
     Polygon,
@@ -50,7 +50,7 @@ def save_picture(data: bytes, out: Path) -> None:
     try:
         out.write_bytes(data)
     except OSError as error:
-        raise ConfigError(f"{out} can't be written: {error.strerror}; does its folder exist?") from None
+        raise unwritable(out, error) from None
     say(f"wrote {out}")
 
 

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import yaml
 
-from camera_node.foundation.errors import ConfigError, describe_failed_write, printable
+from camera_node.foundation.errors import ConfigError, printable, unwritable
 
 T = TypeVar("T")
 NAME = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
@@ -148,7 +148,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
                 os.unlink(name)
             raise
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {describe_failed_write(error)}") from None
+        raise unwritable(path, error) from None
 
 
 class _Dumper(yaml.SafeDumper):

@@ -17,6 +17,7 @@ The exit code tells a service manager whether to retry: 2 stays until a user act
 """
 
 import errno
+from pathlib import Path
 from typing import ClassVar
 
 USER_ERROR, TEMPORARY_FAILURE = 2, 75  # exit codes; the second is EX_TEMPFAIL of sysexits.h
@@ -71,4 +72,9 @@ def describe_failed_write(error: OSError) -> str:
         return f"{error.strerror}; make its folder writable for this user"
     if error.errno in (errno.ENOENT, errno.ENOTDIR):
         return f"{error.strerror}; does its folder exist?"
-    return f"{error.strerror}; check its folder and its disk"
+    return f"{error.strerror or error}; check its folder and its disk"
+
+
+def unwritable(path: Path, error: OSError) -> ConfigError:
+    """The error of a file or folder that could not be written."""
+    return ConfigError(f"{path} can't be written: {describe_failed_write(error)}")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.foundation.config import write_atomically
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.foundation.extras import require
 
 POINT_MM = 25.4 / 72  # PDF's unit
@@ -135,7 +135,7 @@ def _write_pdf(pages: Sequence[Page], path: Path) -> None:
     try:
         canvas.save()
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}; does its folder exist?") from None
+        raise unwritable(path, error) from None
 
 
 def _pdf_shape(canvas: Any, shape: Shape, height: float) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
-from camera_node.foundation.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError, unwritable
 from camera_node.foundation.terminal import track
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_frames import FrameFolder
@@ -106,7 +106,7 @@ def write_observations(path: Path, messages: Iterable[Detections]) -> None:
             writer.writerow(["t_ns", "camera", "u", "v", "marker"])
             writer.writerows(_flatten(messages))
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror}; does its folder exist?") from None
+        raise unwritable(path, error) from None
 
 
 def _flatten(messages: Iterable[Detections]) -> Iterator[tuple]:

@@ -38,7 +38,7 @@ def replay(
         rig: a rig.yaml instead of the recorded one.
         robots: a robots.yaml instead of the recorded one.
         rate_hz: poses a second; without it the rate of the fastest camera.
-        smooth: estimate each pose from the whole recording, not only from the frames before it.
+        smooth: estimate each pose from later frames, too, not only from those before it.
     """
     if out.exists() and recording.exists() and out.samefile(recording):
         raise ConfigError(f"--out {out} is the recording itself; give another file, which is then replaced")

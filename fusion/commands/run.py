@@ -29,7 +29,7 @@ def run(
         frames: a folder of <camera>/<t_ns>.png or .jpg.
         observations: an observations.csv instead of frames.
         rate_hz: poses a second; without it the rate of the fastest camera.
-        smooth: estimate each pose from the whole recording, not only from the frames before it.
+        smooth: estimate each pose from later frames, too, not only from those before it.
     """
     cameras = load_rig(rig).require_placed(rig)
     arena = OfflineArena(cameras, load_robots(robots), rate_hz, smooth=smooth)

@@ -3,19 +3,18 @@
 
 import contextlib
 import csv
-import io
 import os
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.foundation.config import write_atomically
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.foundation.extras import require
 from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.bridges.foxglove_channels import FoxgloveChannels
@@ -39,14 +38,21 @@ def new_path(path: Path) -> Iterator[Path]:
     Raises:
         ConfigError: it can't be written, or the disk is full.
     """
+    with _hidden_path(path) as part:
+        yield part
+        _remove(path)
+        os.replace(part, path)
+
+
+@contextlib.contextmanager
+def _hidden_path(path: Path) -> Iterator[Path]:
+    """The path of `new_path`; what is there in the end is removed."""
     part = path.with_name(f".{path.name}.part{path.suffix}")
     try:
         _remove(part)
         yield part
-        _remove(path)
-        os.replace(part, path)
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {error.strerror or error}; check its folder") from None
+        raise unwritable(path, error) from None
     finally:
         _remove(part)
 
@@ -57,11 +63,10 @@ def write_csv(poses: Iterable[RobotPose], path: Path) -> None:
     Raises:
         ConfigError: the folder can't be written to.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS.split(","))
-    writer.writerows(map(_row, poses))
-    write_atomically(path, text.getvalue())
+    with new_path(path) as part, part.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS.split(","))
+        writer.writerows(map(_row, poses))
 
 
 def _row(pose: RobotPose) -> list:
@@ -136,18 +141,24 @@ def write_tum(poses: RecordedPoses, path: Path) -> list[Path]:
     Returns:
         the files: `path`, or with several robots NAME-ROBOT and the suffix.
     """
-    lines: dict[str, list[str]] = {}
-    for pose in poses:
-        if pose.state != "lost":
+    with _hidden_path(path) as part, contextlib.ExitStack() as opened:
+        part.mkdir()
+        written: dict[str, IO[str]] = {}
+        for pose in poses:
+            if pose.state == "lost":
+                continue
+            if pose.robot not in written:
+                written[pose.robot] = opened.enter_context((part / f"{len(written)}").open("w"))
             w, x, y, z = pose.quaternion_wxyz
             seconds, ns = divmod(pose.t_ns, 1_000_000_000)
             numbers = " ".join(f"{value:.9g}" for value in (*pose.position, x, y, z, w))
-            lines.setdefault(pose.robot, []).append(f"{seconds}.{ns:09} {numbers}\n")
-    several = len(lines) > 1
-    files = {robot: path.with_stem(f"{path.stem}-{robot}") if several else path for robot in lines}
-    for robot, file in files.items():
-        write_atomically(file, "".join(lines[robot]))
-    return list(files.values())
+            written[pose.robot].write(f"{seconds}.{ns:09} {numbers}\n")
+        opened.close()
+        several = len(written) > 1
+        files = [path.with_stem(f"{path.stem}-{robot}") if several else path for robot in written]
+        for k, file in enumerate(files):
+            os.replace(part / f"{k}", file)
+    return files
 
 
 def write_c3d(table: PointTrajectories, path: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from calib.rig.camera import Camera
 from calib.rig.recording import RecordingWriter, as_they_arrived, read_messages
 from calib.rig.rig import load_rig
-from camera_node.foundation.errors import ConfigError, describe_failed_write
+from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.recorded_detections import detect_frames, read_observations
 from fusion.model.frames import CalibratedFrame, FrameSet
@@ -51,7 +51,7 @@ class OfflineArena:
         robots: see `load_robots`.
         rate_hz: poses a second; without it the rate of the fastest camera.
         limits: see `Limits`.
-        smooth: estimate each pose from the whole recording, not only from the frames before it.
+        smooth: estimate each pose from later frames, too (`Smoother`).
 
     Raises:
         ConfigError: the rate is implausible.
@@ -159,11 +159,11 @@ def _fuse(
         if smoother is None:
             yield fused
         else:
-            smoother.add(fused)
+            yield from smoother.add(fused)
         for correction in tracker.check_extrinsics(frame_set, fused):
             summary.add_correction(correction, frame_set.t_ns)
     if smoother is not None:
-        yield from smoother.smooth()
+        yield from smoother.finish()
 
 
 def read_detections(
@@ -304,7 +304,7 @@ def write_recording(source: Path, out: Path, fused: Iterable[TrackingResult]) ->
                 writer.put(*entry)
         os.replace(part, out)
     except OSError as error:
-        raise ConfigError(f"{out} can't be written: {describe_failed_write(error)}") from None
+        raise unwritable(out, error) from None
     finally:
         part.unlink(missing_ok=True)
 

@@ -5,10 +5,13 @@ Rauch, Tung and Striebel (1965) on the steps of the filter: backwards, with the 
 
     x_k|N = x_k + C (x_{k+1|N} - x_{k+1|k}),   P_k|N = P_k + C (P_{k+1|N} - P_{k+1|k}) C^T.
 
-The smoothed track of a robot starts where the robot was acquired and ends where it was lost.
+The smoothed track of a robot starts where the robot was acquired and ends where it was lost. The gains of successive
+steps are multiplied, so what later frame sets change decays, and a recording of any length is smoothed in parts.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -19,36 +22,43 @@ from fusion.model.states import OMEGA, POSITION, THETA, VELOCITY, States
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.result import TrackingResult, claimed_covariances
 
+LAG_NS = 3_000_000_000  # ten times as long as a robot without observations is not lost
+
 
 class Smoother:
-    """Collects tracking results in order; `smooth` returns them with smoothed poses.
+    """Smooths tracking results, which are given in order.
 
     Args:
         names: of the robots, in the order of the states.
+        lag_ns: how much later frame sets change a result, at least; twice as much is held in memory.
     """
 
-    def __init__(self, names: tuple[str, ...]) -> None:
+    def __init__(self, names: tuple[str, ...], lag_ns: int = LAG_NS) -> None:
+        self._lag_ns = lag_ns
         self._row = {name: k for k, name in enumerate(names)}
         self._results: list[TrackingResult] = []
 
-    def add(self, result: TrackingResult) -> None:
-        """Add the next result."""
+    def add(self, result: TrackingResult) -> list[TrackingResult]:
+        """Add the next result; those that are `lag_ns` older, smoothed with their covariances, once in a while."""
         self._results.append(result)
-
-    def smooth(self) -> list[TrackingResult]:
-        """All results with smoothed poses and their covariances."""
-        if not self._results:
+        if result.t_ns - self._results[0].t_ns < 2 * self._lag_ns:
             return []
-        after = self._results[-1].step.states
-        smoothed = [after]
-        for result, following in zip(self._results[-2::-1], self._results[:0:-1], strict=True):
+        smoothed = self._smooth(self._results)
+        n = sum(r.t_ns <= result.t_ns - self._lag_ns for r in smoothed)
+        del self._results[:n]
+        return smoothed[:n]
+
+    def finish(self) -> list[TrackingResult]:
+        """The remaining results."""
+        smoothed, self._results = self._smooth(self._results), []
+        return smoothed
+
+    def _smooth(self, results: Sequence[TrackingResult]) -> list[TrackingResult]:
+        smoothed = [result.step.states for result in results]
+        for k, (result, following) in reversed(list(enumerate(pairwise(results)))):
             step = following.step
-            after = _smooth(result.step.states, step.prediction, after, step.continued)
-            smoothed.append(after)
-        return [
-            self._with_states(result, states)
-            for result, states in zip(self._results, smoothed[::-1], strict=True)
-        ]
+            smoothed[k] = _smooth(result.step.states, step.prediction, smoothed[k + 1], step.continued)
+        return [self._with_states(*both) for both in zip(results, smoothed, strict=True)]
 
     def _with_states(self, result: TrackingResult, states: States) -> TrackingResult:
         wxyz, P = wxyz_from_rotation(states.R), claimed_covariances(states, result.summary)

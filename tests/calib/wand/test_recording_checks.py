@@ -29,7 +29,11 @@ def moved(messages: list[Detections], move: Move, names: tuple[str, ...] = ("cam
 @pytest.mark.parametrize(
     ("mistake", "undo", "cause"),
     [
-        (lambda uv: 3 * uv, lambda uv: uv / 3, r"an image (1\.[5-9]|[23]\.\d)\d times as large, .*fx, fy, cx"),
+        (
+            lambda uv: 3 * uv,
+            lambda uv: uv / 3,
+            r"an image (1\.[5-9]|[23]\.\d)\d times as large, .*fx, fy, cx",
+        ),
         (lambda uv: uv * [1, -1], lambda uv: uv * [1, -1], "v increases upwards from the top row"),
         (lambda uv: uv[:, ::-1], lambda uv: uv[:, ::-1], "turned by 90 degrees: .* exchange u and v"),
         (lambda uv: uv + 9e4, lambda uv: uv - 9e4, "Nothing brings them into the image"),
@@ -56,7 +60,10 @@ def test_the_lens_of_a_camera_with_another_image_is_named():
     with pytest.raises(CalibrationError, match=r"image of 'cam0', 1600 x 1200: are the names"):
         check_recording(
             Rig(cameras={"cam0": large, "cam1": first}),
-            [msgspec.structs.replace(m, width=1600, height=1200) if m.camera == "cam0" else m for m in stated],
+            [
+                msgspec.structs.replace(m, width=1600, height=1200) if m.camera == "cam0" else m
+                for m in stated
+            ],
         )
     check_recording(
         Rig(cameras={"cam0": first, "cam1": large}),

@@ -157,16 +157,20 @@ def channel_and_message(size: int) -> bytes:
     return record(4, channel) + record(5, struct.pack("<HIQQ", 1, 0, 5, 5) + bytes(size))
 
 
-READ_WITH_LITTLE = """
-import resource, sys
+# The peak memory of the program itself: `getrusage` counts what its parent had, too.
+PEAK_KB = """
+import sys
 from collections import Counter
 from pathlib import Path
 from calib.rig.recording import read_messages
 from calib.rig.recording_repair import repair_recording
-path, faults = Path(sys.argv[1]), Counter()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def peak_kb():
+    return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+path, faults, before = Path(sys.argv[1]), Counter(), peak_kb()
+"""
+READ_WITH_LITTLE = f"""{PEAK_KB}
 n = sum(1 for _ in read_messages(path, faults))
-print(n, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, "|", *faults)
+print(n, peak_kb() - before, "|", *faults)
 """
 
 
@@ -212,3 +216,21 @@ def test_larger_chunks_are_rewritten_on_request(tmp_path: Path):
     assert len(found) == 5
     assert not reader.faults()
     assert reader.is_complete
+
+
+REPAIR_WITH_LITTLE = f"""{PEAK_KB}
+print(repair_recording(path).n_messages, peak_kb() - before)
+"""
+
+
+def test_a_recording_that_is_larger_than_the_memory_is_repaired(tmp_path: Path):
+    """Its chunks are read one after the other: the memory grows by a few of them, not by the file's 60 MB."""
+    path, n = tmp_path / "large.mcap", 600
+    write(path, n, size=100_000)
+    with path.open("rb+") as file:
+        file.truncate(path.stat().st_size - 50_000)
+    command = [sys.executable, "-c", REPAIR_WITH_LITTLE, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
+    found, grown_kb = map(int, done.stdout.split())
+    assert n - 20 < found < n
+    assert grown_kb < 20_000

@@ -3,6 +3,7 @@
 
 import csv
 import threading
+from itertools import chain
 from pathlib import Path
 
 import msgspec
@@ -22,6 +23,7 @@ from fusion.protocol.pose_messages import Robots
 from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder, read_recording
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
+from fusion.tracking.smoothing import Smoother
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line
 from tests.fusion.tracks import errors, poses_of
@@ -220,3 +222,19 @@ def test_smoothing_preserves_frame_sets_and_states():
     plain, better = smoothed(arena, False, 30), smoothed(arena, True, 30)
     assert [f.t_ns for f in plain] == [f.t_ns for f in better]
     assert [[p.state for p in f.poses] for f in plain] == [[p.state for p in f.poses] for f in better]
+
+
+def test_a_long_recording_is_smoothed_in_parts_as_if_it_were_whole():
+    """What frame sets later than the lag change is below a thousandth of a standard deviation."""
+    arena = Arena(MOVING.robots, MOVING.motions, sigma_px=0.1, hidden=lambda robot, marker, t: 0.9 < t < 1.1)
+    results, names = smoothed(arena, False, 120), tuple(arena.robots)
+    seconds = 1e-9 * (results[-1].t_ns - results[0].t_ns)
+    parts, whole = Smoother(names, lag_ns=round(1e9)), Smoother(names)
+    in_parts = [[*parts.add(result)] for result in results]
+    assert sum(map(len, in_parts)) >= len(results) * (1 - 2 / seconds)  # no more than twice the lag is held
+    assert not any(whole.add(result) for result in results)
+    both = zip([*chain(*in_parts), *parts.finish()], whole.finish(), strict=True)
+    for part, reference in both:
+        for a, b in zip(part.poses, reference.poses, strict=True):
+            sigma = np.sqrt(np.diag(b.covariance_matrix)[3:6])
+            assert np.abs(np.subtract(a.position, b.position)) == pytest.approx(0, abs=1e-3 * sigma.min())

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Memory and time of the commands on recordings of any length: `python -m tests.benchmarks.recordings [--gb 0.5 2]`.
+
+The recording has 8 cameras, 50 robots, and their poses, for as long as it takes to reach each size; a few seconds of
+messages are repeated with later times. A command's peak memory must not depend on the size. Times are given as a
+multiple of the recorded time.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import tyro
+from rich.table import Table
+
+from calib.rig.recording import RecordingWriter
+from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
+from camera_node.foundation.terminal import console, say
+from camera_node.protocol.messages import Detections, Keys, encode
+from fusion.protocol.pose_messages import RobotPose, Robots, robots_key
+from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
+from tests.benchmarks.fusion_load import Load
+
+ARENA = "large"
+KEYS = Keys(ARENA)
+LIMIT_MB = 300
+BLOCK_S = 6.0  # of messages that are repeated; all motions have this period
+# Prints the exit code and the peak memory of a command. Linux counts what the parent had at the fork, so that is
+# a small process.
+PEAK = """
+import resource, subprocess, sys
+code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL)
+print(code, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+"""
+COMMANDS = {
+    "repair": ("repair", "{path}"),
+    "repair, cut off": ("repair", "{cut}"),
+    "trim": ("trim", "{path}", "{folder}/part.mcap", "--from-s", "1"),
+    "replay": ("replay", "{path}", "--out", "{folder}/poses.csv"),
+    "replay --smooth": ("replay", "{path}", "--smooth", "--out", "{folder}/smooth.mcap"),
+    **{
+        f"export to {name}": ("export", "{path}", "{folder}/" + name)
+        for name in ("x.csv", "x.tum", "x.parquet")
+    },
+    "export to a ROS 2 bag": ("export", "{path}", "{folder}/bag"),
+}
+
+
+def main(gb: tuple[float, ...] = (0.25, 1.0), robots: int = 50, only: str = "") -> None:
+    """Print the peak memory of each command for each size of the recording.
+
+    Args:
+        gb: sizes of the recording, in GB.
+        robots: with 4 markers each, seen by 8 free-running cameras at 60 Hz.
+        only: commands whose names contain this text.
+    """
+    load = Load(robots=robots, period_s=BLOCK_S)
+    columns = [heading for size in gb for heading in (f"{size:g} GB: MB", "of its time")]
+    table = Table("command", *columns)
+    chosen = {name: command for name, command in COMMANDS.items() if only in name}
+    rows: dict[str, list[str]] = {name: [name] for name in chosen}
+    has_failed = False
+    for size in gb:
+        with tempfile.TemporaryDirectory(dir="build" if Path("build").is_dir() else None) as name:
+            folder = Path(name)
+            path = folder / "large.mcap"
+            seconds = write(path, load, size)
+            say(f"{path.stat().st_size / 1e9:.2f} GB, {seconds:.0f} s")
+            for command, arguments in chosen.items():
+                peak_mb, elapsed_s, code = run(arguments, path, folder)
+                has_failed |= code != 0 or peak_mb > LIMIT_MB
+                rows[command] += [
+                    f"{peak_mb:.0f}",
+                    f"{elapsed_s / seconds:.2f}" if not code else f"exit {code}",
+                ]
+    for row in rows.values():
+        table.add_row(*row)
+    console().print(table)
+    sys.exit(has_failed)
+
+
+def write(path: Path, load: Load, gb: float) -> float:
+    """Write a recording of at least this size; its length in seconds."""
+    block = list(load.messages(BLOCK_S))
+    arena = OfflineArena(load.rig, load.bodies)
+    poses = [p for fused in fuse_recording(((m.t_ns, m) for m in block), arena) for p in fused.poses]
+    with RecordingWriter(path) as writer:
+        start_ns, repetition = block[0].t_ns, 0
+        writer.put(KEYS.rig, encode(RigMessage(t_ns=start_ns, rig=Rig(cameras=load.rig))), start_ns)
+        writer.put(robots_key(ARENA), encode(Robots(robots=load.bodies)), start_ns)
+        while writer.size < gb * 1e9:
+            for key, message in repeated(block, poses, repetition):
+                writer.put(key, encode(message), message.t_ns)
+            repetition += 1
+    return repetition * BLOCK_S
+
+
+def repeated(
+    block: list[Detections], poses: list[RobotPose], n: int
+) -> Iterator[tuple[str, Detections | RobotPose]]:
+    """The messages, n times the block later, in order of time, with their keys."""
+    later_ns = round(n * BLOCK_S * 1e9)
+    for message in sorted((*block, *poses), key=lambda m: m.t_ns):
+        shifted = msgspec.structs.replace(message, t_ns=message.t_ns + later_ns)
+        if isinstance(shifted, Detections):
+            yield KEYS.detections(shifted.camera), shifted
+        else:
+            yield KEYS.robot_pose(shifted.robot), shifted
+
+
+def run(arguments: tuple[str, ...], path: Path, folder: Path) -> tuple[float, float, int]:
+    """Peak memory (MB), time (s) and exit code of a command."""
+    cut = folder / "cut.mcap"
+    if any("{cut}" in argument for argument in arguments):
+        subprocess.run(["cp", path, cut], check=True)
+        with cut.open("rb+") as file:
+            file.truncate(path.stat().st_size * 9 // 10)
+    filled = [argument.format(path=path, cut=cut, folder=folder) for argument in arguments]
+    start_s = time.monotonic()
+    command = [sys.executable, "-c", PEAK, Path(sys.executable).with_name("roundel"), *filled]
+    code, peak_kb = map(
+        int, subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.split()
+    )
+    elapsed_s = time.monotonic() - start_s
+    for left in folder.iterdir():
+        if left != path:
+            subprocess.run(["rm", "-r", left], check=True)
+    return peak_kb / 1e3, elapsed_s, code
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
