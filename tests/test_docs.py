@@ -42,7 +42,14 @@ TESTED = {
 }
 PAGES = sorted(path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md"))
 # They change the machine, or need a container engine; tests/test_lab.py checks the services.
-NOT_RUN = ("useradd ", "cp configs/systemd", "systemctl ", "pipx run cibuildwheel", "podman ")
+NOT_RUN = (
+    "useradd ",
+    "cp configs/systemd",
+    "install -D configs/systemd",
+    "systemctl ",
+    "pipx run cibuildwheel",
+    "podman ",
+)
 BUILD = ("cargo ", "cmake ", "build/")  # of the example clients
 PIP = ("python3 -m venv ", "/opt/roundel/bin/pip ", "pip wheel ")  # tests/test_packaging.py
 
