@@ -55,6 +55,7 @@ from calib.wand.quality.checks import (
     find_exchanges,
     triangulated_residuals,
 )
+from calib.wand.quality.contradictions import check_mirrored, check_residuals
 from calib.wand.recording_checks import check_cameras, check_inside, check_recording
 from calib.wand.scale import Distance
 from calib.wand.trajectory import acceleration_density
@@ -357,6 +358,7 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
     check_lenses(recording.names, coarse)
     check_clocks(recording.names, coarse)
     coarse = inflate_covariance(coarse)
+    check_mirrored(recording.wand, coarse)
     clocks = choose_clocks(coarse)
     fine = _prepare_fine(recording, rough, coarse, clocks)
     solution = _adjust_finely(fine, coarse.inflation)
@@ -460,6 +462,9 @@ def _validate(recording: WandRecording, solution: Solution) -> Solution:
     """Measure the residuals of all detections, and of detections that are held out.
 
     Of recordings with very many detections, those in the frame sets of the adjustment are measured.
+
+    Raises:
+        CameraFault, CalibrationError: as in `check_residuals`.
     """
     adjusted, observations = solution.adjusted, solution.observations
     measured = np.ones(len(recording.detections), bool)
@@ -467,6 +472,8 @@ def _validate(recording: WandRecording, solution: Solution) -> Solution:
         measured = np.isin(np.arange(len(measured)), observations.row)
     corrected = recording.with_centres(observations.row, observations.uv).select(measured)
     given = triangulated_residuals(corrected, adjusted.state)
+    lenses = [adjusted.state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
+    check_residuals(corrected, given, adjusted.state.cameras, lenses)
     residuals = np.full(len(measured), np.nan)
     residuals[measured] = np.linalg.norm(given.pixels, axis=1)
     run = recording.timing.instants(corrected.detections.t_s) // RUN

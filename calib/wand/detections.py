@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
 from calib.wand.trajectory import hermite
-from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import RawEllipses
@@ -116,8 +116,8 @@ def gather(
 ) -> tuple[FrameTable, WandDetections]:
     """Collect the detections of the cameras `names` from their messages.
 
-    The `id` of a roundel becomes its label. Detections outside the image, or outside the valid area of a lens model,
-    are dropped.
+    The `id` of a roundel becomes its label. Detections outside the valid area of a lens model are dropped; those a
+    little outside the image are not: a corner of a tag can be.
     """
     index = {name: k for k, name in enumerate(names)}
     messages = sorted(messages, key=lambda message: (index[message.camera], message.t_ns))
@@ -144,16 +144,7 @@ def gather(
         angle_rad[:, 0],
         normalise(lenses, camera[frame], uv),
     )
-    valid = np.isfinite(detections.xy).all(axis=1) & _inside(lenses, detections.camera, uv)
-    return frames, detections.select(np.flatnonzero(valid))
-
-
-def _inside(lenses: Sequence[Camera], camera: Index, uv: Array) -> Mask:
-    """Return (n,) whether pixels (n, 2) of the cameras (n,) lie in their images."""
-    inside = np.zeros(len(uv), bool)
-    for k, lens in enumerate(lenses):
-        inside[camera == k] = lens.sees(uv[camera == k])
-    return inside
+    return frames, detections.select(np.flatnonzero(np.isfinite(detections.xy).all(axis=1)))
 
 
 def image_rows(lenses: Sequence[Lens], camera: Index, uv: Array) -> Array:

@@ -13,7 +13,7 @@ each fault: if a camera fits another one after its timestamps are shifted, or it
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import cv2
 import numpy as np
@@ -38,6 +38,7 @@ from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 
 MIN_FRAME_SETS = 8  # that two cameras must share
+FEW = 4  # markers of a wand, up to which all orders of their numbers are tried: 23
 MANY = 32  # markers of a wand, above which not all of its lengths are compared
 SAMPLE = 1500  # detections that the essential matrix is fitted to
 GATE_PX = 5.0
@@ -482,8 +483,14 @@ def _find_fault(
             "(chrony or NTP) and record again"
         )
     other = max(others, key=lambda j: _count_overlapping(frames, pairs, k, j))
-    if _fits(_mirrored(pairs, k), k, other):
-        return f"its image is mirrored against that of '{names[other]}'; disable the flip and record again"
+    if (mirrored := _fits(_mirrored(pairs, k), k, other)) is not None:
+        return f"its image is mirrored {_axis(mirrored)} against that of '{names[other]}'; disable the flip, or undo it"
+    for order in _orders(pairs):
+        if _fits(_renumbered(pairs, k, order), k, other) is not None:
+            numbers = ", ".join(f"{a} is {b}" for a, b in enumerate(order) if a != b)
+            return (
+                f"its markers have other numbers than those of '{names[other]}': its {numbers}; correct them"
+            )
     if shift_s := _find_large_shift(pairs, k, other):
         return (
             f"its timestamps are {abs(shift_s):.2f} s {_direction(shift_s)} than those of '{names[other]}'; set its "
@@ -509,11 +516,36 @@ def _count_overlapping(frames: FrameTable, pairs: TwoViewGeometry, k: int, other
     return int(((t_s >= mine.min()) & (t_s <= mine.max())).sum())
 
 
-def _fits(pairs: TwoViewGeometry, k: int, other: int) -> bool:
+def _fits(pairs: TwoViewGeometry, k: int, other: int) -> TwoView | None:
+    """Return the relative pose of another camera and camera k, if they fit each other without doubt."""
     found = pairs.relate(other, k)
     if found is None or found.inlier_ratio < MIN_FAULT_RATIO:
-        return False
-    return len(np.unique(pairs.detections.t_s[list(found.depth)])) >= MIN_FAULT_FRAMES
+        return None
+    frames = len(np.unique(pairs.detections.t_s[list(found.depth)]))
+    return found if frames >= MIN_FAULT_FRAMES else None
+
+
+def _axis(mirrored: TwoView) -> str:
+    """Return how an image is mirrored that fits another one once it is flipped left to right: the flip that leaves both
+    cameras upright (a flip from top to bottom is one from left to right, and half a turn)."""
+    upright = np.hypot(*mirrored.T_a_b[:2, 1]) / np.sqrt(2)  # cosine of an eighth of a turn
+    if abs(mirrored.T_a_b[1, 1]) < upright:
+        return "along a diagonal (u and v are exchanged)"
+    return "left to right" if mirrored.T_a_b[1, 1] > 0 else "top to bottom"
+
+
+def _orders(pairs: TwoViewGeometry) -> list[tuple[int, ...]]:
+    """Return the other orders of the numbers of a wand's markers that are tried; of many markers, the reversed one."""
+    count = len(pairs.wand.markers)
+    same = tuple(range(count))
+    return [o for o in (permutations(same) if count <= FEW else [same[::-1]]) if o != same]
+
+
+def _renumbered(pairs: TwoViewGeometry, k: int, order: Sequence[int]) -> TwoViewGeometry:
+    """Return the geometry with the markers of camera k renumbered: number a becomes order[a]."""
+    label = pairs.detections.label.copy()
+    label[pairs.rows[k]] = np.array(order)[label[pairs.rows[k]]]
+    return pairs.with_detections(replace(pairs.detections, label=label))
 
 
 def _mirrored(pairs: TwoViewGeometry, k: int) -> TwoViewGeometry:
@@ -545,7 +577,9 @@ def _find_large_shift(pairs: TwoViewGeometry, k: int, other: int) -> float:
     shift_s = float(shifts[known][gain.argmax()])
     t_s = detections.t_s.copy()
     t_s[pairs.rows[k]] -= shift_s
-    return shift_s if _fits(pairs.with_detections(replace(detections, t_s=t_s)), k, other) else 0.0
+    return (
+        shift_s if _fits(pairs.with_detections(replace(detections, t_s=t_s)), k, other) is not None else 0.0
+    )
 
 
 def explain_unplaced(
@@ -570,6 +604,12 @@ def explain_unplaced(
             reasons[names[k]] = (
                 f"its detections fit no other camera (at best {ratio:.0%} of the shared ones are inliers); "
                 "check its name, its clock and its intrinsics"
+            )
+        elif shared[k].max(where=np.arange(len(names)) != k, initial=0) >= 2 * MIN_FRAME_SETS:
+            j = int(np.argmax(np.where(np.arange(len(names)) != k, shared[k], -1)))
+            reasons[names[k]] = (
+                f"it shares {shared[k, j]} frame sets with '{names[j]}', and no pose explains them: check its name, its "
+                "clock, its intrinsics, and the numbers of its markers"
             )
         else:
             overlap = ", ".join(f"{shared[k, j]} with {name}" for j, name in enumerate(names) if j != k)

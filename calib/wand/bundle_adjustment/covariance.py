@@ -230,6 +230,24 @@ def _lens_likelihood(adjusted: Adjusted) -> tuple[Array, Array]:
     return (with_prior - prior) / variance, with_prior @ adjusted.state.lenses[estimated].ravel() / variance
 
 
+def lens_evidence(adjusted: Adjusted, instead: Array) -> float:
+    """Logarithm of the Bayes factor of other lenses, as corrections (C, 9) of the given ones, over the given ones.
+
+    In either case the true lenses are off by a share of the usual standard deviations that they have in common, uniform
+    between none and all, so that two sets of lenses are told apart as far as the recording determines the lenses.
+    """
+    information, gradient = _lens_likelihood(adjusted)
+    estimated = list(adjusted.problem.estimated_cameras())
+    off = instead[estimated].ravel()
+    sigma = np.array([usual_sigma(adjusted.problem.lenses[k]) for k in estimated]).ravel()
+
+    def evidence(off: Array) -> float:
+        likelihood = _log_marginals(information, gradient - information @ off, SHARES[:, None] * sigma)
+        return float(np.logaddexp.reduce(likelihood[1:] + np.log(UNIFORM[1:])))
+
+    return evidence(off) - evidence(0 * off) + float(off @ gradient - off @ information @ off / 2)
+
+
 def _choose_sigma(problem: Problem, information: Array, gradient: Array) -> tuple[Array, Mask]:
     """(S, 9) standard deviations of the estimated lenses: from their files where the recording does not contradict
     them, else the usual ones, or wider ones where it contradicts these too; and which (S, 9) are the usual ones, of

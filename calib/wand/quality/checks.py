@@ -198,11 +198,13 @@ class TriangulatedResiduals:
     """Residuals of n detections; NaN where fewer than two cameras saw the marker.
 
     Attributes:
+        points: (n, 3) the markers, world.
         pixels: (n, 2) observed minus predicted pixels.
         range_m: (n,) distances of the markers from their cameras.
         focal_px: (n,) focal lengths of the cameras.
     """
 
+    points: Array
     pixels: Array
     range_m: Array
     focal_px: Array
@@ -235,14 +237,16 @@ def triangulated_residuals(recording: WandRecording, state: State) -> Triangulat
     lenses = [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
     recording = recording.with_row_times(state.clocks[:, 2]).undistort_tracks(lenses)
     count = len(recording.detections)
-    pixels, range_m, focal_px = np.full((count, 2), np.nan), np.full(count, np.nan), np.empty(count)
+    points, pixels = np.full((count, 3), np.nan), np.full((count, 2), np.nan)
+    range_m, focal_px = np.full(count, np.nan), np.empty(count)
     for camera, lens in enumerate(lenses):
         rows, T = np.flatnonzero(recording.detections.camera == camera), state.cameras[camera]
-        points = _triangulate_rows(recording, state, lens, camera, rows)
-        pixels[rows] = recording.detections.uv[rows] - lens.project((points - T[:3, 3]) @ T[:3, :3])
-        range_m[rows] = np.linalg.norm(points - T[:3, 3], axis=1)
+        points[rows] = _triangulate_rows(recording, state, lens, camera, rows)
+        away = points[rows] - T[:3, 3]
+        pixels[rows] = recording.detections.uv[rows] - lens.project(away @ T[:3, :3])
+        range_m[rows] = np.linalg.norm(away, axis=1)
         focal_px[rows] = (lens.fx + lens.fy) / 2
-    return TriangulatedResiduals(pixels, range_m, focal_px)
+    return TriangulatedResiduals(points, pixels, range_m, focal_px)
 
 
 def _triangulate_rows(recording: WandRecording, state: State, lens: Lens, camera: int, rows: Index) -> Array:
