@@ -608,8 +608,8 @@ def explain_unplaced(
         elif shared[k].max(where=np.arange(len(names)) != k, initial=0) >= 2 * MIN_FRAME_SETS:
             j = int(np.argmax(np.where(np.arange(len(names)) != k, shared[k], -1)))
             reasons[names[k]] = (
-                f"it shares {shared[k, j]} frame sets with '{names[j]}', and no pose explains them: check its name, its "
-                "clock, its intrinsics, and the numbers of its markers"
+                f"it shares {shared[k, j]} frame sets with '{names[j]}', and no pose explains them: check its name, "
+                "its clock, its intrinsics, and the numbers of its markers"
             )
         else:
             overlap = ", ".join(f"{shared[k, j]} with {name}" for j, name in enumerate(names) if j != k)

@@ -15,6 +15,7 @@ from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import lens_parameters
 from calib.wand.bundle_adjustment.covariance import lens_evidence
 from calib.wand.bundle_adjustment.problem import Adjusted
+from calib.wand.detections import WandRecording
 from calib.wand.quality.checks import (
     GATE,
     GROSS,
@@ -23,7 +24,6 @@ from calib.wand.quality.checks import (
     RAYLEIGH_MEDIAN,
     TriangulatedResiduals,
 )
-from calib.wand.detections import WandRecording
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
@@ -52,8 +52,8 @@ def check_mirrored(wand: Body, adjusted: Adjusted) -> None:
     if evidence[name] > CLEAR and name:
         u = "u by width - 1 - u" if name == "left to right" else "v by height - 1 - v"
         raise CalibrationError(
-            f"the images of all cameras are mirrored {name}: so mirrored, their lenses fit those of the rig file (Bayes "
-            f"factor e^{evidence[name]:.0f}); disable the flip, or replace {u} in the recording"
+            f"the images of all cameras are mirrored {name}: so mirrored, their lenses fit those of the rig file "
+            f"(Bayes factor e^{evidence[name]:.0f}); disable the flip, or replace {u} in the recording"
         )
 
 
@@ -125,9 +125,9 @@ def check_residuals(
     if usual > GATE * size or gross.sum() > HALF * known.sum():
         raise CalibrationError(
             f"the recording contradicts every rig that was found: half of the detections are {usual:.3g} px or more "
-            f"from where the other cameras see them, and {gross.sum() / known.sum():.0%} are gross errors; no camera that moved, "
-            "no clock, mirrored image or exchanged camera explains it. Calibrate pairs of cameras (leave the others "
-            "out of the recording) to find the one that contradicts"
+            f"from where the other cameras see them, and {gross.sum() / known.sum():.0%} are gross errors; no camera "
+            "that moved, no clock, mirrored image or exchanged camera explains it. Calibrate pairs of cameras (leave "
+            "the others out of the recording) to find the one that contradicts"
         )
 
 
@@ -154,17 +154,17 @@ def _explain_motion(
     )
     if not fitted or inliers is None or len(inliers) < max(MIN_COUNT, HALF * len(rows)):
         return 0, ""
-    there = invert(_pose(turn, shift))
+    there = invert(_pose(np.asarray(turn, float), np.asarray(shift, float)))
     apart = np.linalg.norm(there[:3, 3] - camera[:3, 3])
     turned = np.degrees(np.linalg.norm(vector_from_rotation(there[:3, :3] @ camera[:3, :3].T)))
-    t_s = recording.detections.t_s
-    at_s, separated = _separate(t_s[known & ~gross], t_s[rows[inliers.ravel()]])
+    t_s, fitting = recording.detections.t_s, rows[np.asarray(inliers, np.intp).ravel()]
+    at_s, separated = _separate(t_s[known & ~gross], t_s[fitting])
     if not separated:
         return 0, ""
-    return len(inliers), (
-        f"at {at_s:.1f} s of the recording it moved by {apart:.3f} of the rig's units and turned by {turned:.1f} degrees: this pose explains "
-        f"{len(inliers)} of the {len(rows)} detections that contradict the rig. Calibrate the parts of the recording "
-        "before and after that on their own, or leave the camera out"
+    return len(fitting), (
+        f"at {at_s:.1f} s of the recording it moved by {apart:.3f} of the rig's units and turned by {turned:.1f} "
+        f"degrees: this pose explains {len(fitting)} of the {len(rows)} detections that contradict the rig. Calibrate "
+        "the parts of the recording before and after that on their own, or leave the camera out"
     )
 
 
@@ -175,7 +175,8 @@ def _pose(turn: Array, shift: Array) -> Array:
 
 
 def _separate(first: Array, second: Array) -> tuple[float, bool]:
-    """The time that separates times (n,) from times (m,) best, in either order, and whether it separates nine of ten."""
+    """The time that separates times (n,) from times (m,) best, in either order, and whether it separates nine of
+    ten."""
     t_s = np.concatenate([first, second])
     order = np.argsort(t_s, kind="stable")
     is_first = (order < len(first)).astype(float)

@@ -82,7 +82,7 @@ def test_single_points_outside_the_image_are_no_mistake():
     assert result.observations.uv[used].min() > 0
     assert used.sum() > 0.9 * (len(used) - count)
     messages[mine[count]] = nowhere(messages[mine[count]])
-    with pytest.raises(CalibrationError, match="Nothing brings them into the image|are outside its image"):
+    with pytest.raises(CalibrationError, match=r"Nothing brings them into the image|are outside its image"):
         check_recording(arena.intrinsics, messages)
 
 

@@ -26,9 +26,21 @@ BODY = Body(diameter_m=0.05, markers=((0, 0, 0), (0.3, 0, 0), (0, 0.2, 0), (0, 0
 @cache
 def wave(wand: Body = STICK) -> SimulatedRecording:
     """Ten seconds of four synchronous cameras whose lenses have their centres up to 15 px from those of the images."""
-    kind = {"numbered": True, "sized": False, "both_sides": True, "free_running": False}
-    clocks = {"offset_ms": 0.0, "drift_ppm": 0.0}
-    return record_wave(WandScenario(cameras=4, arc=0.5, seconds=10, rate_hz=10, wand=wand, **kind, **clocks))
+    return record_wave(
+        WandScenario(
+            cameras=4,
+            arc=0.5,
+            seconds=10,
+            rate_hz=10,
+            wand=wand,
+            numbered=True,
+            sized=False,
+            both_sides=True,
+            free_running=False,
+            offset_ms=0.0,
+            drift_ppm=0.0,
+        )
+    )
 
 
 def mirrored(messages: Sequence[Detections], axis: int) -> list[Detections]:
@@ -64,7 +76,7 @@ def test_lenses_with_their_centre_in_the_middle_do_not_tell_mirrored_images():
 
 def test_a_wand_that_is_not_flat_shows_mirrored_images():
     recorded = wave(BODY)
-    with pytest.raises(CalibrationError, match="markers are mirrored against its file: .* disable the flip"):
+    with pytest.raises(CalibrationError, match=r"markers are mirrored against its file: .* disable the flip"):
         calibrate(recorded.intrinsics, BODY, mirrored(recorded.messages, 0), synchronous=True)
     opposite = Body(diameter_m=0.05, markers=tuple((x, y, -z) for x, y, z in BODY.markers))
     with pytest.raises(CalibrationError, match="correct the signs of one axis in the wand file"):
