@@ -14,7 +14,6 @@ import msgspec
 from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig, save_rig
 from calib.rig.rig_messages import RigMessage
-from camera_node.foundation.config import dump_yaml
 from camera_node.protocol.camera_requests import change_camera
 from camera_node.protocol.messages import Settings, encode
 from camera_node.protocol.registration import CameraChange, CameraRegistration, register_key
@@ -45,7 +44,8 @@ def main() -> None:
     (FOLDER / "arena.yaml").write_text(ARENA_YAML)
     first = Rig(cameras=ARENA.cameras)
     save_rig(first, FOLDER / "rig.yaml")
-    (FOLDER / "robots.yaml").write_text(dump_yaml(Robots(robots={"a": TRIANGLE})))
+    robots = msgspec.to_builtins({"robots": {"a": TRIANGLE}})
+    (FOLDER / "robots.yaml").write_bytes(msgspec.yaml.encode(robots))
     with serving(load_arena(FOLDER / "arena.yaml")) as (_, client):
         camera = CameraRegistration(id="serial-1", name="camera-1", driver="v4l2")
         send_request(client.session, register_key("test"), encode(camera), DEADLINE_S)
