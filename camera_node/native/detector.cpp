@@ -84,7 +84,10 @@ FrameResult Detector::detect(const ImageView& image) {
         learn_prints(frame);
         learn_camera(frame);
     }
-    for (TrackedFit& roundel : frame.found) bend_.claim(roundel.fit);
+    for (TrackedFit& roundel : frame.found) {
+        response_.claim(roundel.fit);
+        bend_.claim(roundel.fit);
+    }
     return {std::move(frame.found), n_postponed_};
 }
 
@@ -281,7 +284,7 @@ void Detector::learn_camera(const FrameState& frame) {
         if (shows_camera(roundel.fit)) clear.push_back(&roundel.fit);
     light_.learn(clear, frame.image);
     learn_response(clear);
-    bend_.learn(clear);
+    bend_.learn(clear, std::max(1.0, response_.correlation()));
 }
 
 /// Learns the camera's response. Grey levels of a linear image do not compare with those of another one.

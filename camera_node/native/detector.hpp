@@ -95,7 +95,6 @@ class Detector {
                 noise,
                 response_.edge_noise(),
                 response_.curvature_sigma(),
-                response_.correlation(),
                 knows_camera,
                 &response_.remainder()};
     }

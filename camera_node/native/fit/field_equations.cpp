@@ -139,7 +139,7 @@ void add_sums(const FurtherSums<N>& sums, const LinearPart& part, FurtherProduct
 }
 
 struct ScoreSums {
-    Lanes cos3, sin3, bend, cos4, sin4, processing, cos2, sin2, light;
+    Lanes cos3, sin3, bend, cos2, sin2, light;
 };
 
 /// `delta` is a step of the parameters of the part's gradient.
@@ -158,11 +158,7 @@ ROUNDEL_CLONES void add_scores(const LinearPart& part, PartPixels at, const Fiel
                 const Lanes by = -chunks->ring[k] * plane.stretch(X, Y), by_r = wr * by;
                 sums.cos3 += by_r * X * (xx - 3.0f * yy);
                 sums.sin3 += by_r * Y * (3.0f * xx - yy);
-                const Lanes information = w * by * by * rr * rr * rr;
-                sums.bend += information;
-                sums.processing += information * rr;
-                sums.cos4 += by_r * (rr * rr - 8.0f * xx * yy);
-                sums.sin4 += by_r * 4.0f * xy * (xx - yy);
+                sums.bend += w * by * by * rr * rr * rr;
                 const Bits card = plane.is_card(rr);
                 const Lanes on_card = card ? wr : all(0), w_card = card ? w : all(0);
                 sums.cos2 += on_card * (xx - yy);
@@ -209,7 +205,7 @@ FieldScores score_fields(const NormalEquations& equations, const EdgePixels& pix
         add_scores(part, {pixels, part}, plane, step_of(step, part.edge, part.jacobian).data(), weighting,
                    sums);
     return {score(sums.cos3, sums.sin3, sums.bend), score(sums.cos2, 2 * sums.sin2, sums.light),
-            score(sums.cos4, sums.sin4, sums.processing), double(sum(sums.bend)) / 2};
+            double(sum(sums.bend)) / 2};
 }
 
 }  // namespace roundel

@@ -30,10 +30,9 @@ FurtherProducts<kFields> field_products(const NormalEquations& equations, const 
 ///
 /// `bend` is that of displacements of the ring's edges with three periods around it, which no ellipse has;
 /// `light` that of gloss X^2 - Y^2 and 2 X Y.
-/// `processing` is that of displacements with four periods, which no bend makes: compression and sharpening
-/// do. `bend_information` is that on either component of the displacements, per square minor half axis.
+/// `bend_information` is that on either component of the displacements, per square minor half axis.
 struct FieldScores {
-    double bend, light, processing, bend_information;
+    double bend, light, bend_information;
 };
 
 /// The scores of the residuals after a further `step` of the parameters. Pixels of the ground count fully:

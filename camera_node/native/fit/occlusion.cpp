@@ -7,19 +7,19 @@
 #include <numbers>
 #include <numeric>
 
+#include "numeric/cholesky.hpp"
 #include "numeric/simd.hpp"
 
 namespace roundel {
 
 namespace {
 
-constexpr double kBand = 2;    // half width of the band around an edge, pixels
-constexpr int kPixels = 1500;  // approximate number of pixels used
-constexpr double kChance = 4;  // standard deviations
-constexpr double kReach = 2;   // blur of an occluding object's edge, pixels
-constexpr int kAround = 2;     // sectors on either side that a mean includes
-constexpr double kAbsorbed =
-    2;  // twelve means over a sixth of the turn have about six degrees of freedom left
+constexpr double kBand = 2;       // half width of the band around an edge, pixels
+constexpr int kPixels = 1500;     // approximate number of pixels used
+constexpr double kChance = 4;     // standard deviations
+constexpr double kReach = 2;      // blur of an occluding object's edge, pixels
+constexpr int kAround = 2;        // sectors on either side that a mean includes
+constexpr size_t kCluster = 4;    // sectors whose residuals may be correlated: an eighth of the turn
 constexpr double kMinSeen = 0.2;  // of the information in a mean if the whole edge is visible
 
 /// The direction of (x, y) in radians from -pi to pi, within 4e-4: a polynomial in the tangent or its
@@ -161,25 +161,8 @@ Displacement SectorSums::displacement(double noise) const {
     return {std::sqrt(sum / n), std::sqrt(chance / n)};
 }
 
-void SectorSums::add_scatter(Sectors masked, double& sum, int& count) const {
-    for (int s = 0; s < kSectors; ++s) {
-        double across = 0, along = 0;
-        Sectors used = 0;
-        for (int k = s - kAround; k <= s + kAround; ++k) {
-            const auto at = size_t(k + kSectors) % kSectors;
-            across += regression_[at];
-            along += squared_[at];
-            used |= Sectors(1) << at;
-        }
-        if (along > 0 && !(used & masked)) {
-            sum += across * across / along;
-            ++count;
-        }
-    }
-}
-
 EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p, const Fields& fields)
-    : circles_{circle_image(p, 1), circle_image(p, p[kRatio])} {
+    : p_(p), circles_{circle_image(p, 1), circle_image(p, p[kRatio])} {
     EdgePixels pixels;
     pixels.origin_x = int(std::lround(p[kX]));
     pixels.origin_y = int(std::lround(p[kY]));
@@ -205,12 +188,72 @@ OcclusionMask EdgeMisfit::occlusion(double noise, double slack) const {
             dilate(edges_[1].exceeding(noise, slack), circles_[1])};
 }
 
+std::array<std::array<EdgeSlopes, kSectors>, 2> EdgeMisfit::edge_slopes() const {
+    const double Axx = p_[kAxx], Axy = p_[kAxy], Ayy = p_[kAyy], det = Axx * Ayy - Axy * Axy;
+    std::array<std::array<EdgeSlopes, kSectors>, 2> slopes;
+    for (size_t s = 0; s < kSectors; ++s) {
+        const double angle = (double(s) + 0.5) * 2 * std::numbers::pi / kSectors;
+        const double u = std::cos(angle), v = std::sin(angle);
+        // The edge's normal in the image, A^-1 (u, v), and the direction A (u, v) from the centre.
+        const double nx = Ayy * u - Axy * v, ny = Axx * v - Axy * u,
+                     n = std::copysign(std::hypot(nx, ny), det);
+        const double outwards = det / n;
+        for (const size_t edge : {0, 1}) {
+            const double r = edge ? p_[kRatio] : 1, x = r * nx / n, y = r * ny / n;
+            slopes[edge][s] = {nx / n,
+                               ny / n,
+                               x * u,
+                               x * v + y * u,
+                               y * v,
+                               -r * r * u * outwards,
+                               -r * r * v * outwards,
+                               edge ? outwards : 0};
+        }
+    }
+    return slopes;
+}
+
 double EdgeMisfit::correlation(double noise, const OcclusionMask& mask) const {
-    double sum = 0;
-    int count = 0;
-    edges_[0].add_scatter(mask.outer, sum, count);
-    edges_[1].add_scatter(mask.inner, sum, count);
-    return count ? std::max(1.0, kAbsorbed * sum / (count * noise * noise)) : 1;
+    using Matrix = std::array<EdgeSlopes, kEdgeParameters>;
+    const auto slopes = edge_slopes();
+    const Sectors masked[2] = {mask.outer, mask.inner};
+    const auto each = [&](size_t first, size_t count, const auto& use) {
+        for (const size_t edge : {0, 1})
+            for (size_t s = first; s < first + count; ++s)
+                if (!(masked[edge] >> s & 1)) use(slopes[edge][s], edges_[edge].score(s));
+    };
+    Matrix information{};
+    EdgeSlopes right{};
+    each(0, kSectors, [&](const EdgeSlopes& by, const SectorSums::Score& score) {
+        for (size_t i = 0; i < kEdgeParameters; ++i) {
+            right[i] += by[i] * score.sum;
+            for (size_t j = 0; j <= i; ++j) information[i][j] += score.variance * by[i] * by[j];
+        }
+    });
+    const Cholesky<kEdgeParameters> factor(information);
+    if (!factor.positive()) return 1;
+    const EdgeSlopes solution = factor.solve(right);
+    double seen = 0, expected = 0;
+    for (size_t first = 0; first < kSectors; first += kCluster) {
+        EdgeSlopes sum{};
+        Matrix share{};  // of the information, whitened: the clusters' add up to the unit matrix
+        each(first, kCluster, [&](const EdgeSlopes& by, const SectorSums::Score& score) {
+            double left = score.sum;  // of the score, after what the parameters absorb
+            for (size_t i = 0; i < kEdgeParameters; ++i) left -= score.variance * by[i] * solution[i];
+            const EdgeSlopes white = factor.halfway(by);
+            for (size_t i = 0; i < kEdgeParameters; ++i) {
+                sum[i] += white[i] * left;
+                for (size_t j = 0; j < kEdgeParameters; ++j)
+                    share[i][j] += score.variance * white[i] * white[j];
+            }
+        });
+        for (size_t i = 0; i < kEdgeParameters; ++i) {
+            seen += square(sum[i]);
+            expected += share[i][i];
+            for (size_t j = 0; j < kEdgeParameters; ++j) expected -= square(share[i][j]);
+        }
+    }
+    return expected > 0 ? seen / (expected * square(noise)) : 1;
 }
 
 std::array<Displacement, 2> EdgeMisfit::displacements(double noise) const {

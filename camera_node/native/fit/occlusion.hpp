@@ -51,15 +51,22 @@ class SectorSums {
     /// deviations.
     Sectors exceeding(double noise, double slack) const;
     Displacement displacement(double noise) const;
-    /// Adds the squared scores of means over a sixth of the turn, in variances of independent residuals of
-    /// variance 1, and their number. Means that contain `masked` sectors do not count.
-    void add_scatter(Sectors masked, double& sum, int& count) const;
+    /// The sum of products of slope and residual in a sector, and its variance if residuals are independent
+    /// with a variance of 1: the score of a displacement of that part of the edge.
+    struct Score {
+        double sum, variance;
+    };
+    Score score(size_t sector) const { return {regression_[sector], squared_[sector]}; }
     /// Appends the weighted mean square of each sector that has pixels.
     void append_mean_squares(std::vector<double>& to) const;
 
   private:
     std::array<double, kSectors> rr_{}, weight_{}, squared_{}, regression_{};
 };
+
+/// The displacement of a place of an edge by each parameter of the pose, and by the ratio.
+constexpr int kEdgeParameters = kPoseCount + 1;
+using EdgeSlopes = Vector<kEdgeParameters>;
 
 /// The residuals of the model `p` and its fields (both in the image's frame) on both edges of the ring.
 class EdgeMisfit {
@@ -74,12 +81,19 @@ class EdgeMisfit {
     /// Displacements of the outer and of the inner edge. Ragged edges (drawn, printed, sharpened) scatter
     /// about the right position, so their means hardly differ from it.
     std::array<Displacement, 2> displacements(double noise) const;
-    /// The factor by which residuals that are correlated along the edges enlarge the covariance of a fit
-    /// (a cluster-robust covariance has such factors for all directions): 1 if they are independent with the
-    /// standard deviation `noise`, grey levels. Sectors in the mask do not count.
+    /// The factor by which residuals that are correlated along the edges enlarge the covariance of the pose:
+    /// about 1 (with 14 degrees of freedom) if they are independent with the standard deviation `noise`, grey
+    /// levels. Sectors in the mask do not count. It is the ratio of the traces of the cluster-robust
+    /// covariance, with eighths of the turn as clusters, and of its expectation for independent residuals,
+    /// which includes what the parameters absorb (Liang and Zeger, 1986; Bell and McCaffrey, 2002).
     double correlation(double noise, const OcclusionMask& mask) const;
 
   private:
+    /// The displacement of each edge, at the middle of each sector, by each parameter of the pose and by the
+    /// ratio, pixels.
+    std::array<std::array<EdgeSlopes, kSectors>, 2> edge_slopes() const;
+
+    Parameters p_;
     CircleImage circles_[2];
     std::array<SectorSums, 2> edges_;
 };

@@ -381,8 +381,7 @@ bool PhotometricFitter::shows_bend() {
     Parameters step = p_;
     for (int i = 0; i < kCount; ++i) step[i] -= linearized_at_[i];
     fields_.scores = score_fields(equations_, pixels_, FieldFrame(p_), step, {scale_, spread_});
-    for (double* score : {&fields_.scores.bend, &fields_.scores.light, &fields_.scores.processing})
-        *score /= square(noise_);
+    for (double* score : {&fields_.scores.bend, &fields_.scores.light}) *score /= square(noise_);
     const double most =
         std::clamp(kBentResidual * (p_[kAxx] + p_[kAyy]), kLeastBentResidual, kMostBentResidual);
     return allowed_ == AllowedFields::kBend && fields_.scores.bend > kUnlikelyField &&
@@ -635,11 +634,10 @@ void PhotometricFitter::add_fields(PoseCovariance& inverse) const {
 Bend PhotometricFitter::bend() const {
     if (fields_.fitted)
         return {square(fields_.in_image.bend()),
-                square(noise_) * (fields_.cov[kBend][kBend] + fields_.cov[kBend + 1][kBend + 1]) / 2,
-                fields_.scores.processing};
+                square(noise_) * (fields_.cov[kBend][kBend] + fields_.cov[kBend + 1][kBend + 1]) / 2};
     if (!(fields_.scores.bend_information > 0)) return {};
     const double variance = square(noise_) / fields_.scores.bend_information;
-    return {fields_.scores.bend * variance, variance, fields_.scores.processing};
+    return {fields_.scores.bend * variance, variance};
 }
 
 PoseCovariance PhotometricFitter::pose_covariance() const {

@@ -62,9 +62,8 @@ struct Shading {
 
 /// The bend of the paper that the residuals show (detector_model.md, section 3b): the squared length of
 /// its two components and the variance of each, square minor half axes; 0 and 0 if it was not measured.
-/// `processing` is the score of displacements that no bend makes (`FieldScores`).
 struct Bend {
-    double squared = 0, variance = 0, processing = 0;
+    double squared = 0, variance = 0;
 };
 
 /// A roundel fitted to the grey levels around its edges.

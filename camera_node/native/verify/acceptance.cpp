@@ -253,13 +253,11 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
             if (const TestedFit again = test(image, weighed, context); again.accepted) tested = again;
     }
     auto& [fit, misfit, elliptic, accepted] = tested;
-    if (fit.fields.has_light())
-        fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / context.correlation));
     claim_misfit(fit, context.noise);
     if (fit.unoccluded || guess.model) return fit.unoccluded ? std::optional(fit) : std::nullopt;
     const double at_edges = misfit ? likely_edge_noise(context, *misfit, fit) : context.noise;
-    const auto rest = fit_occluded(
-        image, {guess, fit, misfit, at_edges, context.correlation, known || accepted, context.knows_camera});
+    const auto rest =
+        fit_occluded(image, {guess, fit, misfit, at_edges, known || accepted, context.knows_camera});
     if (rest && is_within_limits(*rest, context.limits)) return rest;
     if (accepted) return fit;
     return elliptic && may_be_ragged(fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;

@@ -46,7 +46,6 @@ struct AcceptanceContext {
     double noise;                // of the image, grey levels
     double edge_noise = 0;       // residual at the edges of this camera's roundels, grey levels; 0 if unknown
     double curvature_sigma = 0;  // of what is left of this camera's tone curve
-    double correlation = 1;      // of residuals that its processing makes (`EdgeMisfit::correlation`)
     bool knows_camera = true;    // tone curve and processing; else fits may be provisional
     const ToneRemainder* tone = nullptr;  // expected to be left of its tone curve
 };

@@ -137,6 +137,10 @@ void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits
     correlation_ += gain * (median_of(&RoundelFit::correlation) - correlation_);
 }
 
+void CameraResponse::claim(RoundelFit& fit) const {
+    fit.pose_cov = scaled(fit.pose_cov, std::max({1.0, fit.correlation, correlation_}));
+}
+
 /// The excess of the differences from the prints' ratios over their uncertainty, which counts twice so that
 /// chance alone does not widen the claims of a linear camera. A squared normal variable has the median 0.455.
 void CameraResponse::learn_curvature(const std::vector<const RoundelFit*>& fits,

@@ -36,6 +36,9 @@ class CameraResponse {
     double edge_noise() const { return edge_noise_; }
     /// Correlation of these residuals along the edges, as `EdgeMisfit::correlation`; 1 if unknown.
     double correlation() const { return correlation_; }
+    /// Widens a fit's covariance by the correlation of the residuals along the edges: that of the camera's
+    /// roundels, or the roundel's own if shadows or compression make it larger.
+    void claim(RoundelFit& fit) const;
     /// Standard deviation of the curvature, between ink and paper, that `remainder` does not contain.
     double curvature_sigma() const { return std::sqrt(curvature_); }
     /// What linearization is known to leave.

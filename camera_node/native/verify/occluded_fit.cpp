@@ -181,7 +181,6 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
     }
     if (!fit.is_explained(input.noise, kRestMisfit)) return std::nullopt;
     fit.correlation = EdgeMisfit(image, fit.p, fit.fields).correlation(fit.noise, guess.occlusion);
-    fit.pose_cov = scaled(fit.pose_cov, std::max(1.0, fit.correlation / input.correlation));
     if (input.known) return fit;
     if (hides_inner_edge_only(guess.occlusion)) return std::nullopt;
     fit.provisional = !input.knows_camera;

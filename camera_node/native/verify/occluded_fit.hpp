@@ -27,7 +27,6 @@ struct OccludedGuess {
     const RoundelFit& full_fit;        // to all sectors
     std::optional<EdgeMisfit> misfit;  // of `full_fit`, if it was computed
     double noise;                      // of the image, grey levels
-    double correlation;                // of the camera's residuals
     bool known;                        // from the last frame
     bool knows_camera;                 // its tone curve and its processing
 };

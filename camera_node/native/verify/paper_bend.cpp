@@ -17,7 +17,6 @@ constexpr double kUnknownTilt = 0.15;
 // Squared bends over the tangent of the tilt:
 constexpr double kSmallBend = 1e-6;  // of paper bent by 0.25 % of its width, from which roundels count alike
 constexpr double kMostBend = 4e-4;   // by 5 %, which no print has
-constexpr double kMostScore = 20;    // of a roundel's displacements that no bend makes
 constexpr double kChance = 2;        // standard deviations of a mean that noise explains
 constexpr double kMemory = 0.9;      // of a frame in the next one
 // Squared displacements over the squared length of the bend that shows:
@@ -38,28 +37,12 @@ double PaperBend::Sums::lower() const {
     return weight > 0 ? std::max(0.0, excess - kChance * std::sqrt(scatter)) / weight : 0;
 }
 
-/// Compression and sharpening displace edges with any number of periods around the ring, a bend with three.
-void PaperBend::learn_processing(const std::vector<const RoundelFit*>& fits) {
-    double sum = 0;
-    int count = 0;
-    for (const RoundelFit* fit : fits)
-        if (fit->bend.variance > 0) {
-            sum += std::min(fit->bend.processing, kMostScore);
-            ++count;
-        }
-    if (!count) return;
-    measured_.weight = kMemory * measured_.weight + count;
-    measured_.excess = kMemory * measured_.excess + sum;
-    processing_ = std::max(1.0, measured_.excess / (2 * measured_.weight));
-}
-
-void PaperBend::learn(const std::vector<const RoundelFit*>& fits) {
-    learn_processing(fits);
+void PaperBend::learn(const std::vector<const RoundelFit*>& fits, double correlation) {
     Sums now;
     for (const RoundelFit* fit : fits) {
         if (!(fit->bend.variance > 0)) continue;
         const double tilt = squared_tilt(FieldFrame(fit->p));
-        const double noise = 2 * fit->bend.variance * processing_ / tilt;
+        const double noise = 2 * fit->bend.variance * correlation / tilt;
         const double weight = 1 / square(noise + kSmallBend);
         now.weight += weight;
         now.scatter += square(weight * noise);

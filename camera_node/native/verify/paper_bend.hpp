@@ -11,8 +11,9 @@ namespace roundel {
 /// show how much that may be. Flat prints teach that there is no bend, and their claims stay as they are.
 class PaperBend {
   public:
-    /// Learns from the fits of a frame without occlusion, in even light.
-    void learn(const std::vector<const RoundelFit*>& fits);
+    /// Learns from the fits of a frame without occlusion, in even light, whose residuals have this
+    /// `correlation` along the edges (`EdgeMisfit::correlation`): processing displaces edges, too.
+    void learn(const std::vector<const RoundelFit*>& fits, double correlation);
     /// Adds to a fit's covariance what a bend displaces that the fit does not contain.
     void claim(RoundelFit& fit) const;
 
@@ -23,12 +24,10 @@ class PaperBend {
         /// The mean, less than which is unlikely; 0 if noise explains it.
         double lower() const;
     };
-    void learn_processing(const std::vector<const RoundelFit*>& fits);
     double unseen(const RoundelFit& fit, double tilt) const;
 
-    Sums remembered_, measured_;
-    double processing_ = 1;  // score of displacements that no bend makes, over that of independent residuals
-    double squared_ = 0;     // mean square of a bend over the tangent of the tilt
+    Sums remembered_;
+    double squared_ = 0;  // mean square of a bend over the tangent of the tilt
 };
 
 }  // namespace roundel
