@@ -37,11 +37,10 @@ Detector::Detector(RoundelLimits limits, double search_share, bool by_paper)
     : limits_(std::move(limits)),
       search_share_(search_share),
       chords_(limits_, limits_.any_print),
-      matcher_(limits_) {
+      matcher_(limits_),
+      camera_(limits_.prints, limits_.any_print) {
     if (by_paper) paper_.emplace();
-    if (!limits_.any_print) return;
-    print_ratios_.emplace();
-    limits_.prints = print_ratios_->prints();
+    limits_.prints = camera_.prints();
 }
 
 Detector::FrameState::FrameState(const ImageView& given, const ImageView& linearized, bool known)
@@ -55,7 +54,7 @@ FrameResult Detector::detect(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
     // 1. Grey levels in proportion to light, as far as the response of this camera is known.
-    FrameState frame(image, response_.linearize(image), knows_camera());
+    FrameState frame(image, camera_.linearize(image), camera_.is_known());
     // 2. The roundels of the last frame, at their predicted positions.
     const std::vector<ExpectedRoundel> lost = fit_tracked(frame);
     // 3. New ones: local thresholds and chords give seeds, rays from these a conic, the photometric fit the
@@ -80,14 +79,8 @@ FrameResult Detector::detect(const ImageView& image) {
     else
         mark_searched(parts, frame.found);
     // 6. What the roundels show of their prints and of the camera.
-    if (!learned) {
-        learn_prints(frame);
-        learn_camera(frame);
-    }
-    for (TrackedFit& roundel : frame.found) {
-        response_.claim(roundel.fit);
-        bend_.claim(roundel.fit);
-    }
+    if (!learned) observe(frame);
+    for (TrackedFit& roundel : frame.found) camera_.claim(roundel.fit);
     return {std::move(frame.found), n_postponed_};
 }
 
@@ -95,8 +88,8 @@ FrameResult Detector::detect(const ImageView& image) {
 std::optional<InitialGuess> Detector::guess(const Seed& seed, const FrameState& frame) const {
     auto guess = fit_rays(frame.encoded, seed, limits_);
     if (!guess) return guess;
-    guess->dark = response_.linear(guess->dark);
-    guess->bright = response_.linear(guess->bright);
+    guess->dark = camera_.linear(guess->dark);
+    guess->bright = camera_.linear(guess->bright);
     return guess;
 }
 
@@ -107,8 +100,8 @@ std::vector<ExpectedRoundel> Detector::fit_tracked(FrameState& frame) const {
     for (const ExpectedRoundel& expected : tracks_.expect()) {
         if (expected.steady && fit_and_accept(expected.guess(), expected.track, frame)) continue;
         Seed seed = expected.seed;
-        seed.dark = int(response_.encoded(seed.dark));
-        seed.bright = int(response_.encoded(seed.bright));
+        seed.dark = int(camera_.encoded(seed.dark));
+        seed.bright = int(camera_.encoded(seed.bright));
         if (!fit_and_accept(guess(seed, frame), expected.track, frame)) lost.push_back(expected);
     }
     return lost;
@@ -153,7 +146,7 @@ static double tile_contrast(double noise, const RoundelLimits& limits) {
 /// Searches the parts of the image for the chords of rings, and for the streaks of moving ones.
 Detector::Candidates Detector::find_candidates(const FrameState& frame, const std::vector<Box>& parts) {
     Candidates candidates;
-    const bool linear = response_.exponent_in_use() == 1;
+    const bool linear = camera_.exponent_in_use() == 1;
     const double noise = linear ? frame.noise : noise_level(frame.encoded);
     for (const Box& part : parts) {
         const ImageView view = window(frame.encoded, part);
@@ -243,58 +236,39 @@ static bool shows_camera(const RoundelFit& fit) { return fit.unoccluded && !fit.
 bool Detector::decide(FrameState& frame) {
     if (frame.undecided.empty()) return false;
     frame.decided = true;
-    std::vector<const RoundelFit*> seen;
-    for (const TrackedFit& roundel : frame.found)
-        if (shows_camera(roundel.fit)) seen.push_back(&roundel.fit);
-    for (const RoundelFit& fit : frame.undecided) seen.push_back(&fit);
-    const bool learns = seen.size() >= kMinWitnesses;
+    const auto shown = std::count_if(frame.found.begin(), frame.found.end(),
+                                     [](const TrackedFit& roundel) { return shows_camera(roundel.fit); });
+    const bool learns = size_t(shown) + frame.undecided.size() >= kMinWitnesses;
     if (learns) {
-        learn_prints(frame);
-        learn_response(seen);
-        frame.image = response_.linearize(frame.encoded);
+        observe(frame);
+        frame.image = camera_.linearize(frame.encoded);
         frame.noise = noise_level(frame.image);
     }
     for (const RoundelFit& fit : frame.undecided)
         fit_and_accept(
-            InitialGuess{fit.outer, fit.ratio, response_.linear(fit.dark), response_.linear(fit.bright)}, -1,
+            InitialGuess{fit.outer, fit.ratio, camera_.linear(fit.dark), camera_.linear(fit.bright)}, -1,
             frame);
     frame.undecided.clear();
     return learns;
 }
 
-/// Learns which prints are in use. Rings of other ratios count as roundels all the same.
-void Detector::learn_prints(const FrameState& frame) {
-    if (!print_ratios_) return;
-    std::vector<PrintSample> samples;
+/// Learns what the roundels of a frame, and those that are not decided yet, show of the camera.
+void Detector::observe(const FrameState& frame) {
+    std::vector<Observation> roundels;
     for (const TrackedFit& roundel : frame.found)
-        if (shows_camera(roundel.fit)) samples.push_back({&roundel.fit, roundel.track});
-    for (const RoundelFit& fit : frame.undecided) samples.push_back({&fit, -1});
-    if (print_ratios_->learn(samples)) use_prints();
+        if (shows_camera(roundel.fit)) roundels.push_back({&roundel.fit, roundel.track});
+    for (const RoundelFit& fit : frame.undecided) roundels.push_back({&fit, -1});
+    camera_.observe(roundels, frame.image);
+    use_camera();
 }
 
-void Detector::use_prints() {
-    limits_.prints = print_ratios_->prints();
+/// Rings of other ratios than those of the camera's prints count as roundels all the same.
+void Detector::use_camera() {
+    limits_.prints = camera_.prints();
     matcher_.use_prints(limits_.prints);
-}
-
-/// Learns what processing, light and bent paper do to the roundels of this camera.
-void Detector::learn_camera(const FrameState& frame) {
-    std::vector<const RoundelFit*> clear;
-    for (const TrackedFit& roundel : frame.found)
-        if (shows_camera(roundel.fit)) clear.push_back(&roundel.fit);
-    light_.learn(clear, frame.image);
-    learn_response(clear);
-    bend_.learn(clear, std::max(1.0, response_.correlation()));
-}
-
-/// Learns the camera's response. Grey levels of a linear image do not compare with those of another one.
-void Detector::learn_response(const std::vector<const RoundelFit*>& clear) {
-    const double exponent = response_.exponent_in_use();
-    if (!response_.learn(clear, limits_)) return;
-    limits_.linearized_by = response_.exponent_in_use();
+    if (limits_.linearized_by == camera_.exponent_in_use()) return;
+    limits_.linearized_by = camera_.exponent_in_use();
     tracks_.forget_models();
-    light_.scale(response_.exponent_in_use() / exponent);
-    if (print_ratios_) print_ratios_->forget_measurements();
 }
 
 /// Section III-B of the paper: theta follows the mean levels of the roundels.
@@ -349,7 +323,7 @@ bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameStat
 std::vector<RefusedRing> Detector::explain(const ImageView& image) {
     const std::lock_guard lock(mutex_);
     if (image.width < 3 || image.height < 3) return {};
-    const ImageView linear = response_.linearize(image);
+    const ImageView linear = camera_.linearize(image);
     return explain_refusals(linear, context(noise_level(linear)));
 }
 
@@ -360,26 +334,21 @@ std::optional<double> Detector::theta() const {
 
 std::vector<double> Detector::found_ratios() const {
     const std::lock_guard lock(mutex_);
-    return print_ratios_ ? print_ratios_->recurring() : std::vector<double>();
+    return camera_.recurring();
 }
 
 std::optional<double> Detector::tone_exponent() const {
     const std::lock_guard lock(mutex_);
-    return response_.exponent();
+    return camera_.exponent();
 }
 
 void Detector::take_over(Detector& from) {
     if (&from == this) return;
     const std::scoped_lock lock(mutex_, from.mutex_);
     tracks_ = from.tracks_;
-    response_ = from.response_;
-    bend_ = from.bend_;
-    light_ = from.light_;
-    limits_.linearized_by = response_.exponent_in_use();
-    if (print_ratios_ && from.print_ratios_) {
-        print_ratios_ = from.print_ratios_;
-        use_prints();
-    }
+    camera_.take_over(from.camera_);
+    limits_.linearized_by = camera_.exponent_in_use();
+    use_camera();
     if (paper_ && from.paper_) paper_ = from.paper_;
 }
 

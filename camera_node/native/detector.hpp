@@ -14,10 +14,7 @@
 #include "search/chords.hpp"
 #include "search/suppression.hpp"
 #include "tracks.hpp"
-#include "verify/camera_response.hpp"
-#include "verify/light_falloff.hpp"
-#include "verify/paper_bend.hpp"
-#include "verify/print_ratios.hpp"
+#include "verify/camera_model.hpp"
 
 namespace roundel {
 
@@ -79,35 +76,23 @@ class Detector {
     void update_theta(const std::vector<TrackedFit>& found);
     void mark_searched(const std::vector<Box>& parts, const std::vector<TrackedFit>& found);
     bool decide(FrameState& frame);
-    void learn_prints(const FrameState& frame);
-    void use_prints();
-    void learn_camera(const FrameState& frame);
-    void learn_response(const std::vector<const RoundelFit*>& clear);
+    void observe(const FrameState& frame);
+    void use_camera();
 
     bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
     bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
     std::optional<InitialGuess> guess(const Seed& seed, const FrameState& frame) const;
-    bool knows_camera() const { return response_.edge_noise() > 0; }
     AcceptanceContext context(const FrameState& frame) const { return context(frame.noise, frame.decided); }
     AcceptanceContext context(double noise, bool knows_camera = true) const {
-        return {limits_,
-                light_,
-                noise,
-                response_.edge_noise(),
-                response_.curvature_sigma(),
-                knows_camera,
-                &response_.remainder()};
+        return {limits_, camera_, noise, knows_camera};
     }
 
     RoundelLimits limits_;
-    std::optional<PrintRatios> print_ratios_;  // if they were not given
     double search_share_;
     ChordSearch chords_;
     MotionBlurMatcher matcher_;
     std::optional<PaperSearch> paper_;
-    CameraResponse response_;
-    LightFalloff light_;
-    PaperBend bend_;
+    CameraModel camera_;
     Tracks tracks_;
     ChangeMask change_mask_;
     double searched_to_ = 0;  // share of the height, of the bands searched in turns

@@ -40,8 +40,8 @@ std::optional<RefusedRing> refuse(const ImageView& image, const InitialGuess& gu
                                   const AcceptanceContext& context) {
     const RefusedRing seen{guess.outer, guess.ratio, guess.bright - guess.dark, 0, Refusal::kNoFit};
     InitialGuess start = guess;
-    start.light = context.light.at(guess.outer.x, guess.outer.y);
-    start.tone = context.tone;
+    start.camera = context.camera.prior_at(guess.outer.x, guess.outer.y);
+    start.camera.prints = {};
     if (const auto accepted = fit_roundel(image, start, context, false)) {
         const bool bullseye = is_bullseye(image, *accepted, kRingDepth);
         if (!bullseye && has_black_ink(*accepted)) return std::nullopt;

@@ -34,7 +34,7 @@ std::vector<Ellipse> Tracks::lost() const {
 }
 
 InitialGuess ExpectedRoundel::guess() const {
-    InitialGuess guess{fit.outer, fit.ratio, fit.dark, fit.bright, {}, {}, fit.p, fit.noise, fit.ground};
+    InitialGuess guess{fit.outer, fit.ratio, fit.dark, fit.bright, {}, fit.p, fit.noise, fit.ground};
     guess.outer.x += vx;
     guess.outer.y += vy;
     (*guess.model)[kX] += vx;

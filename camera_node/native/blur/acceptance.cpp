@@ -49,7 +49,8 @@ std::optional<RoundelFit> fit_new_moving(const ImageView& image, const MovingGue
 std::optional<RoundelFit> fit_known_moving(const ImageView& image, const KnownRoundel& known,
                                            const AcceptanceContext& context) {
     const RoundelFit& last = known.last;
-    const double noise = std::max(context.noise, context.edge_noise);  // with what processing leaves at edges
+    const double noise =
+        std::max(context.noise, context.camera.edge_noise());  // with what processing leaves at edges
     const auto fit_from = [&](const MovingGuess& guess) {
         const auto fit = fit_moving(image, guess);
         return fit && is_accepted(*fit, context, noise, kMaxSigma) && is_similar(*fit, last) ? fit

@@ -711,9 +711,10 @@ bool converges(PhotometricFitter& fitter, const InitialGuess& guess) {
 /// The fit at a solution, with what is known of levels, tone curve, print and light.
 RoundelFit conclude(PhotometricFitter& fitter, const InitialGuess& guess) {
     fitter.use_plateaus();
-    fitter.expect_curvature(guess.tone, guess.curvature_sigma);
-    if (!guess.prints.empty()) fitter.use_print(nearest_print(guess.prints, fitter.ratio()));
-    if (guess.light.sigma > 0 && !fitter.knows_light()) fitter.allow_shading(guess.light);
+    const CameraPrior& camera = guess.camera;
+    fitter.expect_curvature(camera.tone, camera.curvature_sigma);
+    if (!camera.prints.empty()) fitter.use_print(nearest_print(camera.prints, fitter.ratio()));
+    if (camera.light.sigma > 0 && !fitter.knows_light()) fitter.allow_shading(camera.light);
     return fitter.fit();
 }
 

@@ -29,18 +29,23 @@ struct LightGradient {
     double x = 0, y = 0, sigma = 0;
 };
 
+/// What is known of a camera and its prints where a roundel is, before it is fitted.
+struct CameraPrior {
+    std::span<const Print> prints{};  // in use, if they are known
+    LightGradient light{};
+    const ToneRemainder* tone = nullptr;  // expected to be left of the tone curve
+    double curvature_sigma = 0;           // of the curvature that is left beside it; 0 for none
+};
+
 /// The initial guess of a fit: an ellipse within a pixel, the ratio of the diameters, and the grey levels.
 struct InitialGuess {
     Ellipse outer;
     double ratio, dark, bright;
-    std::span<const Print> prints{};    // in use, if they are known
     OcclusionMask occlusion{};          // sectors that the fit leaves out
     std::optional<Parameters> model{};  // in the image's frame, within a third of a pixel, if known
     double noise = 0;                   // noise that the fit of `model` estimated,
     double ground = 0;                  // and `RoundelFit::ground`
-    LightGradient light{};
-    const ToneRemainder* tone = nullptr;  // expected to be left of the tone curve
-    double curvature_sigma = 0;           // of the curvature that is left beside it; 0 for none
+    CameraPrior camera{};
     AllowedFields fields = AllowedFields::kNone;
 };
 

@@ -106,15 +106,15 @@ std::optional<RoundelFit> fit_ragged(const ImageView& image, const InitialGuess&
                                      const AcceptanceContext& context) {
     const auto fit = fit_smoothed(image, guess);
     const Tolerance tolerance{guess.outer.major < kMinRagged ? kMisfit : kRaggedMisfit, kMaxRaggedGrowth};
-    const AcceptanceContext smoothed{context.limits, context.light, context.noise * 6 / 16};
+    const AcceptanceContext smoothed{context.limits, context.camera, context.noise * 6 / 16};
     return fit && passes(image, *fit, smoothed, tolerance) ? fit : std::nullopt;
 }
 
 /// Residuals at the edges of this camera's roundels. Before any is known, those of most sectors of an
 /// accepted one: sharpening and compression change all of an edge, an occlusion a part of it.
 double likely_edge_noise(const AcceptanceContext& context, const EdgeMisfit& misfit, const RoundelFit& fit) {
-    const double processing = context.edge_noise > 0
-                                  ? context.edge_noise
+    const double processing = context.camera.is_known()
+                                  ? context.camera.edge_noise()
                                   : std::min(misfit.median(), kMaxProcessing * fit.contrast());
     return std::max(context.noise, processing);
 }
@@ -227,10 +227,7 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
 
 std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
                                       const AcceptanceContext& context, bool known) {
-    guess.prints = context.limits.prints;
-    guess.light = context.light.at(guess.outer.x, guess.outer.y);
-    guess.curvature_sigma = context.curvature_sigma;
-    guess.tone = context.tone;
+    guess.camera = context.camera.prior_at(guess.outer.x, guess.outer.y);
     guess.fields = AllowedFields::kBend;
     const auto fits = fit_on_ground(image, guess);
     if (!fits) return std::nullopt;
@@ -238,7 +235,7 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
     TestedFit tested = test(image, *first, context);
     const bool is_even = tested.fit.unoccluded && !first->uneven;
     // Before the camera is known, its tone curve and its processing look like uneven light.
-    if (context.edge_noise > 0 && (first->uneven || !tested.fit.unoccluded) &&
+    if (context.camera.is_known() && (first->uneven || !tested.fit.unoccluded) &&
         is_within_limits(*first, context.limits))
         if (const auto even =
                 fit_uneven(image, guess, *first, fits->weighed ? fits->weighed->ground : 0, context);
@@ -249,7 +246,7 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
         // The ground displaces a small fit, whose residuals then look like those of an occlusion.
         if (is_even)
             tested.fit = weighed;
-        else if (context.edge_noise > 0 && !first->uneven && !tested.fit.unoccluded)
+        else if (context.camera.is_known() && !first->uneven && !tested.fit.unoccluded)
             if (const TestedFit again = test(image, weighed, context); again.accepted) tested = again;
     }
     auto& [fit, misfit, elliptic, accepted] = tested;

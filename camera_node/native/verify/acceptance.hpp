@@ -5,7 +5,7 @@
 #include "fit/photometric_fit.hpp"
 #include "fit/roundel_limits.hpp"
 #include "numeric/image.hpp"
-#include "verify/light_falloff.hpp"
+#include "verify/camera_model.hpp"
 
 namespace roundel {
 
@@ -42,12 +42,9 @@ bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits);
 /// What the acceptance tests of a frame depend on, beside the fit.
 struct AcceptanceContext {
     const RoundelLimits& limits;
-    const LightFalloff& light;   // of this camera
-    double noise;                // of the image, grey levels
-    double edge_noise = 0;       // residual at the edges of this camera's roundels, grey levels; 0 if unknown
-    double curvature_sigma = 0;  // of what is left of this camera's tone curve
-    bool knows_camera = true;    // tone curve and processing; else fits may be provisional
-    const ToneRemainder* tone = nullptr;  // expected to be left of its tone curve
+    const CameraModel& camera;
+    double noise;              // of the image, grey levels
+    bool knows_camera = true;  // as well as this frame shows it; else fits may be provisional
 };
 
 /// Fits a roundel and applies the acceptance tests that reject false positives. If the fit to the unmodified

@@ -150,7 +150,7 @@ bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noi
 
 bool is_certain_roundel(const ImageView& image, const RoundelFit& fit, const InitialGuess& guess,
                         double noise, double ratio_slack) {
-    if (!has_print_ratio(fit, guess.prints, ratio_slack)) return false;
+    if (!has_print_ratio(fit, guess.camera.prints, ratio_slack)) return false;
     const SectorView view(image, fit);
     return has_round_card(view) || !is_letter(view, fit, guess.occlusion, noise);
 }
@@ -169,11 +169,8 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
                  .ratio = fit.ratio,
                  .dark = fit.dark,
                  .bright = fit.bright,
-                 .prints = guess.prints,
                  .occlusion = mask,
-                 .light = guess.light,
-                 .tone = guess.tone,
-                 .curvature_sigma = guess.curvature_sigma};
+                 .camera = guess.camera};
         const auto rest = fit_photometric(image, guess);
         if (!rest) return std::nullopt;
         fit = *rest;

@@ -154,7 +154,7 @@ bool PrintRatios::collect() {
     return !same;
 }
 
-bool PrintRatios::learn(const std::vector<PrintSample>& roundels) {
+bool PrintRatios::learn(const std::vector<Observation>& roundels) {
     std::array<int, kMaxKinds> seen{};
     for (const auto& [fit, track] : roundels) {
         if (fit->outer.major < kMinDiameter || fit->clipped || fit->ratio_sigma > kMaxRatioSigma) continue;

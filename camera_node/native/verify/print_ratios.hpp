@@ -13,7 +13,7 @@ namespace roundel {
 double ratio_by_curvature(const RoundelFit& fit, double print_ratio);
 
 /// A roundel of a frame without occlusion, and the number of its track.
-struct PrintSample {
+struct Observation {
     const RoundelFit* fit;
     int track;
 };
@@ -29,7 +29,7 @@ class PrintRatios {
   public:
     PrintRatios();
     /// Includes the roundels of a frame. The caller must use `prints` from now on if this returns true.
-    bool learn(const std::vector<PrintSample>& roundels);
+    bool learn(const std::vector<Observation>& roundels);
     /// The prints in use: the usual ones, of which some may be replaced, and others that recur.
     const std::vector<Print>& prints() const { return prints_; }
     /// The prints that recur.

@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: BSD-3-Clause
-#include "verify/camera_response.hpp"
+#include "verify/camera_model.hpp"
 
 #include <algorithm>
 #include <cmath>
-
-#include "verify/print_ratios.hpp"
 
 namespace roundel {
 
@@ -54,13 +52,18 @@ T& median_by(std::vector<T>& values, const Key& key) {
 
 }  // namespace
 
-CameraResponse::CameraResponse() { set_exponent(0); }
+CameraModel::CameraModel(std::vector<Print> given, bool any) : prints_(std::move(given)) {
+    set_exponent(0);
+    if (!any) return;
+    ratios_.emplace();
+    prints_ = ratios_->prints();
+}
 
-std::optional<double> CameraResponse::exponent() const {
+std::optional<double> CameraModel::exponent() const {
     return knows_tone_ ? std::optional(std::exp(log_exponent_)) : std::nullopt;
 }
 
-ImageView CameraResponse::linearize(const ImageView& image) {
+ImageView CameraModel::linearize(const ImageView& image) {
     if (log_exponent_ == 0) return image;
     buffer_.resize(size_t(image.width) * size_t(image.height));
     uint8_t* to = buffer_.data();
@@ -70,28 +73,47 @@ ImageView CameraResponse::linearize(const ImageView& image) {
     return {buffer_.data(), image.width, image.height, image.width};
 }
 
-bool CameraResponse::learn(const std::vector<const RoundelFit*>& fits, const RoundelLimits& limits) {
+CameraPrior CameraModel::prior_at(double x, double y) const {
+    return {prints_, light_.at(x, y), &remainder_, std::sqrt(curvature_)};
+}
+
+void CameraModel::observe(const std::vector<Observation>& roundels, const ImageView& image) {
+    if (ratios_ && ratios_->learn(roundels)) prints_ = ratios_->prints();
+    std::vector<const RoundelFit*> all, whole;
+    for (const auto& [fit, track] : roundels) {
+        all.push_back(fit);
+        if (fit->unoccluded) whole.push_back(fit);
+    }
+    light_.learn(whole, image);
+    learn_response(all);
+    bend_.learn(whole, std::max(1.0, correlation_));
+}
+
+/// Learns tone curve and processing. Grey levels of a linear image do not compare with those of another one.
+void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
     learn_edge_noise(fits);
     std::vector<ToneEstimate> measured;
     const size_t step = (fits.size() + kMaxMeasured - 1) / kMaxMeasured;
     for (size_t k = 0; k < fits.size(); k += step)
-        if (const auto estimate = measure(*fits[k], limits)) {
+        if (const auto estimate = measure(*fits[k])) {
             measured.push_back(estimate->power);
             tone_.include(estimate->sample);
         }
-    if (knows_tone_) learn_curvature(fits, limits);
-    if (measured.empty()) return false;
+    if (knows_tone_) learn_curvature(fits);
+    if (measured.empty()) return;
+    const double exponent = exponent_in_use();
     const bool changed = learn_tone(std::move(measured));
     learn_remainder(changed);
-    return changed;
+    if (!changed) return;
+    light_.scale(exponent_in_use() / exponent);
+    if (ratios_) ratios_->forget_measurements();
 }
 
 /// What the difference between the measured ratio and the print's says about the tone curve. A curve that
 /// brightens the levels between ink and paper by `curvature` s (1 - s) moves both edges into the ring.
-std::optional<CameraResponse::ToneMeasurement> CameraResponse::measure(const RoundelFit& fit,
-                                                                       const RoundelLimits& limits) const {
+std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFit& fit) const {
     if (fit.outer.major < kMinDiameter || fit.dark < kDarkest || fit.bright > kBrightest) return std::nullopt;
-    const Print& print = nearest_print(limits.prints, fit.ratio);
+    const Print& print = nearest_print(prints_, fit.ratio);
     const double by_curvature = ratio_by_curvature(fit, print.ratio);
     const double left = (fit.ratio - print.ratio) / by_curvature, curvature = left + fit.curvature;
     const double sigma = std::hypot(fit.ratio_sigma, print.sigma) / by_curvature;
@@ -107,7 +129,7 @@ std::optional<CameraResponse::ToneMeasurement> CameraResponse::measure(const Rou
 }
 
 /// What the tone curve leaves beside the power, if the power does not describe it.
-void CameraResponse::learn_remainder(bool linearization_changed) {
+void CameraModel::learn_remainder(bool linearization_changed) {
     if (n_learned_++ % kFitInterval && n_learned_ > kFirstFits && !linearization_changed) return;
     tone_.fit();
     const double exponent = std::exp(log_exponent_);
@@ -124,7 +146,7 @@ void CameraResponse::learn_remainder(bool linearization_changed) {
     remainder_ = ToneRemainder(light);
 }
 
-void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
+void CameraModel::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
     if (fits.empty()) return;
     const auto median_of = [&](double RoundelFit::* of) {
         std::vector<double> values;
@@ -137,18 +159,31 @@ void CameraResponse::learn_edge_noise(const std::vector<const RoundelFit*>& fits
     correlation_ += gain * (median_of(&RoundelFit::correlation) - correlation_);
 }
 
-void CameraResponse::claim(RoundelFit& fit) const {
+void CameraModel::claim(RoundelFit& fit) const {
     fit.pose_cov = scaled(fit.pose_cov, std::max({1.0, fit.correlation, correlation_}));
+    bend_.claim(fit);
+}
+
+void CameraModel::take_over(const CameraModel& from) {
+    auto prints = std::move(prints_);
+    auto ratios = std::move(ratios_);
+    *this = from;
+    if (ratios && ratios_) return;
+    prints_ = std::move(prints);
+    ratios_ = std::move(ratios);
+}
+
+std::vector<double> CameraModel::recurring() const {
+    return ratios_ ? ratios_->recurring() : std::vector<double>();
 }
 
 /// The excess of the differences from the prints' ratios over their uncertainty, which counts twice so that
 /// chance alone does not widen the claims of a linear camera. A squared normal variable has the median 0.455.
-void CameraResponse::learn_curvature(const std::vector<const RoundelFit*>& fits,
-                                     const RoundelLimits& limits) {
+void CameraModel::learn_curvature(const std::vector<const RoundelFit*>& fits) {
     std::vector<double> excess;
     for (const RoundelFit* fit : fits) {
         if (fit->outer.major < kMinDiameter || fit->clipped) continue;
-        const Print& print = nearest_print(limits.prints, fit->ratio);
+        const Print& print = nearest_print(prints_, fit->ratio);
         const double by_curvature = ratio_by_curvature(*fit, print.ratio);
         const double curvature = (fit->ratio - print.ratio) / by_curvature;
         const double sigma = std::hypot(fit->ratio_sigma, print.sigma) / by_curvature;
@@ -163,7 +198,7 @@ void CameraResponse::learn_curvature(const std::vector<const RoundelFit*>& fits,
 
 /// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames,
 /// are as certain as the best roundel.
-bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
+bool CameraModel::learn_tone(std::vector<ToneEstimate> measured) {
     const double middle =
         median_by(measured, [](const ToneEstimate& e) { return e.log_exponent; }).log_exponent;
     const double sigma = std::min_element(measured.begin(), measured.end(), [](const auto& a, const auto& b) {
@@ -182,7 +217,7 @@ bool CameraResponse::learn_tone(std::vector<ToneEstimate> measured) {
     return true;
 }
 
-void CameraResponse::set_exponent(double log_exponent) {
+void CameraModel::set_exponent(double log_exponent) {
     log_exponent_ = log_exponent;
     for (int level = 0; level < 256; ++level) linear_[size_t(level)] = uint8_t(std::lround(linear(level)));
 }
