@@ -123,7 +123,9 @@ class Arena:
         with self._lock:
             if name not in self._robots:
                 content = f"pose of '{name}' {self._origin}"
-                stream = RobotStream(content, timeout_s, lambda: self.why_no_poses(name), self._age)
+                stream = RobotStream(
+                    content, timeout_s, lambda: self.why_no_poses(name), self._age, self.time.now_ns
+                )
                 self._robots[name] = stream
                 if name in self._newest:
                     stream._put(*self._newest[name])

@@ -146,7 +146,23 @@ class Stream(Generic[T]):
 
 
 class RobotStream(Stream[RobotPose]):
-    """The poses of one robot."""
+    """The poses of one robot.
+
+    Args:
+        content, timeout_s, cause, age: see `Stream`.
+        now_ns: the server's present time; None before it is known.
+    """
+
+    def __init__(
+        self,
+        content: str,
+        timeout_s: float | None,
+        cause: Callable[[], str],
+        age: Callable[[RobotPose, float], float],
+        now_ns: Callable[[], int | None],
+    ) -> None:
+        super().__init__(content, timeout_s, cause, age)
+        self._now_ns = now_ns
 
     _located: tuple[RobotPose, float] | None = None  # the newest pose that is not of a lost robot
 
@@ -157,6 +173,17 @@ class RobotStream(Stream[RobotPose]):
         """
         pose = super().latest(max_age_s)
         return None if pose is not None and max_age_s is not None and pose.state == "lost" else pose
+
+    def now(self, max_age_s: float) -> RobotPose | None:
+        """The newest pose, predicted for the present with its grown covariance (`RobotPose.at`).
+
+        None if that pose is older than `max_age_s`, if the robot is lost, and before the server's time is known.
+
+        Raises:
+            ValueError: the server is of a version before 0.1 and does not say how robots move.
+        """
+        pose, now_ns = self.latest(max_age_s), self._now_ns()
+        return None if pose is None or now_ns is None else pose.at(now_ns)
 
     def age_s(self) -> float:
         """As of `Stream`; while the robot is lost, the age of the last pose before it was lost."""

@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.config import is_name
+from camera_node.geometry.pose import rotation_from_wxyz, wxyz_from_rotation
 from camera_node.protocol.messages import VERSION, MessageError
 from camera_node.protocol.requests import RequestSource
 from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot, load_robots, require_trackable, save_robots
+from fusion.model.states import States, predict, reset_unobservable
 
 Vector = tuple[float, float, float]
 MAX_NUMBER = 1e5  # of a coordinate or velocity, in metres, m/s or rad/s
+MAX_PREDICTION_S = 30.0  # as the server's own: the covariance then says nothing
 QUATERNION_SLACK = 1e-3  # of the length of a rotation's quaternion
 TrackingState = Literal["tracked", "coasting", "lost"]
 
@@ -44,6 +47,7 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
     into the world; `angular_velocity` (rad/s) is in the world. `covariance` is (12, 12) <f4, row by row, in GTSAM's
     order: rotation (vector in the body's frame), position (world), angular velocity (world), velocity (world). The +z
     axis of a robot with one marker is the marker's normal; the covariance of its rotation about that axis is large.
+    `at` predicts it for another time.
     """
 
     version: int = VERSION
@@ -59,6 +63,10 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
     cameras: tuple[str, ...] = ()  # cameras used in this frame set
     residual_px: float | None = None  # RMS reprojection error in this frame set
     latency: Latency | None = None  # None offline
+    evidence_age_s: float | None = None  # from the newest frame set in which a camera saw the robot to `t_ns`
+    body_markers: int = 0  # markers of the robot; 0 if the server does not say it
+    # Power spectral densities of its white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
+    acceleration_density: tuple[float, float] | None = None
 
     def check(self) -> None:
         """Raise MessageError unless numbers are in range, the quaternion has length 1 and the covariance is 12 x 12."""
@@ -69,11 +77,56 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError("the pose's quaternion is not of length 1")
         if len(self.covariance) != 576 or not all(abs(x) <= MAX_NUMBER for x in numbers):
             raise MessageError("the pose is out of range, or its covariance is not 12 x 12")
+        motion = (self.evidence_age_s or 0.0, self.body_markers, *(self.acceleration_density or ()))
+        if not all(0 <= x <= MAX_NUMBER for x in motion):
+            raise MessageError("the pose's age, number of markers or density of acceleration is out of range")
 
     @property
     def covariance_matrix(self) -> Array:
         """(12, 12) covariance: rotation, position, angular velocity, velocity."""
         return np.frombuffer(self.covariance, "<f4").reshape(12, 12).astype(float)
+
+    def at(self, t_ns: int) -> "RobotPose":
+        """The pose predicted for another time, by the filter's own motion model, with its covariance.
+
+        Velocities stay; white noise on accelerations widens the covariance, also towards times before `t_ns`. A lost
+        robot stays where it was.
+
+        Args:
+            t_ns: in the server's time.
+
+        Raises:
+            ValueError: the message has no `acceleration_density`, as those of servers before 0.1, or the time is more
+                than 30 s away.
+        """
+        dt = (t_ns - self.t_ns) * 1e-9
+        if self.acceleration_density is None:
+            raise ValueError(
+                f"the pose of '{self.robot}' does not say how its robot moves: update the server"
+            )
+        if not abs(dt) <= MAX_PREDICTION_S:
+            raise ValueError(f"{dt:g} s from the pose of '{self.robot}'; {MAX_PREDICTION_S:g} s at most")
+        if dt == 0 or self.state == "lost":
+            return msgspec.structs.replace(self, t_ns=t_ns)
+        direction = np.repeat([1.0, np.copysign(1.0, dt)], 6)  # of the errors of pose and of velocities
+        known = States(
+            rotation_from_wxyz(self.quaternion_wxyz)[None],
+            np.array([self.position]),
+            direction[-1] * np.array([self.angular_velocity]),
+            direction[-1] * np.array([self.velocity]),
+            (direction[:, None] * self.covariance_matrix * direction)[None],
+        )
+        densities, single = np.array([self.acceleration_density]), np.array([self.body_markers == 1])
+        predicted, _ = predict(known, np.array([abs(dt)]), densities, single)
+        P = direction[:, None] * (reset_unobservable(predicted.P) if single else predicted.P)[0] * direction
+        return msgspec.structs.replace(
+            self,
+            t_ns=t_ns,
+            position=tuple(predicted.p[0].tolist()),
+            quaternion_wxyz=tuple(wxyz_from_rotation(predicted.R[0]).tolist()),
+            covariance=P.astype("<f4").tobytes(),
+            evidence_age_s=None if self.evidence_age_s is None else max(self.evidence_age_s + dt, 0.0),
+        )
 
 
 class RobotPoses(msgspec.Struct, frozen=True, kw_only=True):

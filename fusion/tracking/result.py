@@ -162,7 +162,11 @@ def robot_poses(
     p, v, omega = _tuples(states.p), _tuples(states.v), _tuples(states.omega)
     wxyz, residual = _tuples(wxyz_from_rotation(states.R)), summary.residual_px.tolist()
     P, markers = claimed_covariances(states, summary).astype("<f4").tobytes(), summary.n_markers.tolist()
-    owned, seen_by = table.owned.tolist(), summary.robot_cameras.tolist()
+    owned, seen_by, age_s = (
+        table.owned.tolist(),
+        summary.robot_cameras.tolist(),
+        table.unseen_s(t_ns).tolist(),
+    )
     return {
         k: RobotPose(
             robot=table.names[k],
@@ -176,6 +180,9 @@ def robot_poses(
             n_markers=markers[k],
             cameras=tuple(compress(names, seen_by[k])),
             residual_px=residual[k] if markers[k] else None,
+            evidence_age_s=age_s[k],
+            body_markers=len(table.robots[k].markers),
+            acceleration_density=table.densities[k],
         )
         for k in rows
         if owned[k] and (state := status[k]) is not None

@@ -28,6 +28,7 @@ class TrackTable:
     Attributes:
         names, robots, markers: the robots and their marker table.
         single: (N,) robots with a single marker.
+        densities: of their accelerations; see `MotionModel.densities`.
         owned: (N,) robots that this shard estimates.
         states: at `t_ns`; a new object after each change.
         status: None for a robot that was never acquired.
@@ -39,6 +40,7 @@ class TrackTable:
         self.names, self.robots = tuple(robots), list(robots.values())
         self.markers = MarkerTable.of(self.robots)
         self.single = np.array([robot.is_single for robot in self.robots], bool)
+        self.densities = [robot.densities for robot in self.robots]
         self.owned = np.array([shard.owns(name) for name in self.names], bool)
         self.states = States.at_rest(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), START_SIGMAS)
         self.status: list[TrackingState | None] = [None] * n
@@ -57,6 +59,10 @@ class TrackTable:
     def tracked(self) -> Mask:
         """(N,) robots whose status is `tracked`."""
         return np.array([status == "tracked" for status in self.status], bool)
+
+    def unseen_s(self, t_ns: int) -> Array:
+        """(N,) seconds until `t_ns` since the last frame set that observed each robot; 0 for those in acquisition."""
+        return np.where(self._seen_ns > 0, np.maximum(t_ns - self._seen_ns, 0) * 1e-9, 0.0)
 
     def inherit(self, old: "TrackTable", renamed: dict[str, str]) -> None:
         """Copy states and status of the robots that `old` has with the same markers; `renamed` maps old names."""

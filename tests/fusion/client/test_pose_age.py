@@ -3,6 +3,7 @@
 
 import math
 
+import msgspec
 import pytest
 
 from camera_node.protocol.server_connection import ServerConnection
@@ -60,10 +61,24 @@ def test_the_age_is_at_least_the_time_since_arrival():
 
 def test_a_lost_robot_has_no_recent_pose_and_the_age_of_its_last_one():
     ages = {1: 3.0, 2: 0.0}
-    stream = RobotStream("", None, lambda: "", lambda pose, _: ages[pose.t_ns])
+    stream = RobotStream("", None, lambda: "", lambda pose, _: ages[pose.t_ns], lambda: None)
     assert (stream.latest(), stream.age_s()) == (None, math.inf)
     stream._put(moving_pose("rover", 1))
     stream._put(moving_pose("rover", 2, state="lost"))
     assert stream.latest(MAX_AGE_S) is None
     assert stream.age_s() == 3.0
     assert stream.latest() == moving_pose("rover", 2, state="lost")
+
+
+def test_a_pose_is_predicted_for_the_present_while_it_is_recent():
+    """By the server's time, which the stream asks for."""
+    pose = msgspec.structs.replace(
+        moving_pose("rover", 10**18), acceleration_density=(1.0, 1.0), body_markers=3
+    )
+    ages, now_ns = {pose.t_ns: 0.02}, pose.t_ns + 20_000_000
+    stream = RobotStream("", None, lambda: "", lambda pose, _: ages[pose.t_ns], lambda: now_ns)
+    assert stream.now(MAX_AGE_S) is None
+    stream._put(pose)
+    assert stream.now(MAX_AGE_S) == pose.at(now_ns)
+    ages[pose.t_ns] = 2 * MAX_AGE_S
+    assert stream.now(MAX_AGE_S) is None
