@@ -15,6 +15,7 @@ from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import lens_parameters
 from calib.wand.bundle_adjustment.covariance import lens_evidence
 from calib.wand.bundle_adjustment.problem import Adjusted
+from calib.wand.bundle_adjustment.problem_setup import MIN_SIGMA_PX
 from calib.wand.detections import WandRecording
 from calib.wand.quality.checks import (
     GATE,
@@ -109,7 +110,7 @@ def check_residuals(
     known = np.isfinite(off)
     if not known.any():
         return
-    usual = float(np.median(off[known])) / RAYLEIGH_MEDIAN
+    usual = max(float(np.median(off[known])) / RAYLEIGH_MEDIAN, MIN_SIGMA_PX)
     gross = known & (off > GROSS * usual)
     moved: list[tuple[int, str, str]] = []
     for k, lens in enumerate(lenses):
