@@ -56,12 +56,14 @@ class Intrinsics:
         if self.live and self.camera is None:
             raise ConfigError("--live needs --camera NAME, as the camera was started with --name")
         rig = load_rig(self.out) if self.out.exists() else None
-        lenses, faults = {}, []
+        lenses: dict[str, CalibratedLens] = {}
+        faults: dict[str, list[str]] = {}
         for views in self._collect_views():
             try:
                 lens = views.calibrate(self.model)
             except CalibrationError as error:
-                faults.append(str(error))
+                fault = str(error).removeprefix(f"camera '{views.camera}': ")
+                faults.setdefault(fault, []).append(views.camera)
                 continue
             lenses[views.camera] = lens
             print_lens(views.camera, lens)
@@ -72,7 +74,8 @@ class Intrinsics:
             write_rig(merge_lenses(rig, lenses, {**provenance(), "board": self.board}), self.out)
         if faults:
             written = f"; written without it: {', '.join(lenses)}" if lenses else ""
-            raise CalibrationError("; ".join(faults) + written)
+            each = (f"camera {', '.join(map(repr, cameras))}: {fault}" for fault, cameras in faults.items())
+            raise CalibrationError("; ".join(each) + written)
 
     def _collect_views(self) -> Iterator[BoardViews]:
         finder = make_finder(self.board)

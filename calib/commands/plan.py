@@ -19,7 +19,7 @@ from calib.plan.plan_summary import describe, summarize
 from calib.plan.planner import PlannedArena, evaluate, plan_around
 from calib.rig.camera import Camera
 from calib.rig.rig import load_rig
-from camera_node.foundation.config import dump_yaml, load_yaml, write_atomically
+from camera_node.foundation.config import dump_yaml, example_file, load_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import progress_bar, say
 
@@ -94,7 +94,7 @@ class PlanArena:
     def _check_files(self) -> None:
         """Raise ConfigError for options that contradict each other, and for files that can't be written."""
         if self.plan is None and self.rig is None:
-            raise ConfigError("give a plan such as configs/plan.yaml, or --rig with a calibrated rig")
+            raise ConfigError(f"give a plan such as {example_file('plan.yaml')}, or --rig with a calibrated rig")
         if self.rig is not None and self.suggest is not None:
             raise ConfigError("--suggest places new cameras, --rig evaluates mounted ones; give one of them")
         if self.suggest is not None and not 1 <= self.suggest <= MAX_CAMERAS:

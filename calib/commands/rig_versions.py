@@ -8,6 +8,7 @@ from pathlib import Path
 from calib.commands.output import conclude, put_in_force
 from calib.rig.file_history import History, HistoryStep
 from calib.rig.rig import Rig, load_rig
+from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 
@@ -22,6 +23,12 @@ class RestoreOptions:
     live: bool = False
     """Have the running server use the restored rig too."""
     connection: ConnectionOptions = LOCAL_SERVER
+
+    def history(self) -> History:
+        """Its versions; raises ConfigError if neither the file nor an earlier version exists."""
+        if not self.rig.exists() and not (self.rig.parent.is_dir() and History(self.rig).older()):
+            raise ConfigError(f"{self.rig} does not exist; check --rig")
+        return History(self.rig)
 
     def conclude(self, rig: Rig, step: HistoryStep, program: str) -> None:
         """Print what was restored, and hand it to the server."""
@@ -38,7 +45,7 @@ class Undo(RestoreOptions):
 
     def run(self) -> None:
         """Swap the files, and hand the restored rig to the server."""
-        history = History(self.rig)
+        history = self.history()
         rig = load_rig(history.previous())  # a broken one is not restored
         self.conclude(rig, history.undo(), "roundel calibrate undo")
 
@@ -49,7 +56,7 @@ class Redo(RestoreOptions):
 
     def run(self) -> None:
         """Swap the files, and hand the restored rig to the server."""
-        history = History(self.rig)
+        history = self.history()
         rig = load_rig(history.next())
         self.conclude(rig, history.redo(), "roundel calibrate redo")
 

@@ -31,6 +31,7 @@ CLEARLY_NOT_SQUARE = 0.005  # of fx / fy from 1: lenses of good cameras differ b
 Model = Literal["pinhole", "fisheye"]
 
 COEFFICIENTS = {"pinhole": 5, "fisheye": 4}
+NO_BOARD = "the board is in no image; check --board, and that the images show the whole board, sharp and not mirrored"
 MIN_VIEWS = 8
 MAX_VIEWS = 60  # more are slower, not better
 MIN_TILT_DEG = 10.0  # between views: parallel views leave the focal length open
@@ -205,6 +206,8 @@ class BoardViews:
                 f"camera '{self.camera}': its images show the board mirrored, as from behind; disable the flip of the "
                 "camera, or of the driver"
             )
+        if not self.views:
+            raise CalibrationError(f"camera '{self.camera}': {NO_BOARD}")
         if self.size is None or len(self.views) < MIN_VIEWS:
             raise CalibrationError(
                 f"camera '{self.camera}': the board is in {len(self.views)} of {self.frames} frames, {MIN_VIEWS} are "

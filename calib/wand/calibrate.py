@@ -308,7 +308,7 @@ def _place(
     faults = find_faults(names, recording.frames, pairs, start.placed)
     unplaced = explain_unplaced(names, counts, shared, start) | excluded | faults | certain
     if len(start.placed) < 2:
-        raise CalibrationError(explain_failure(names, counts, shared, unplaced, excluded | faults))
+        raise CalibrationError(explain_failure(names, counts, shared, excluded | faults))
     by_distance = len(recording.wand.markers) == 1
     return Placement(
         recording.of_cameras(start.placed),

@@ -638,7 +638,6 @@ def explain_failure(
     names: Sequence[str],
     counts: Sequence[int],
     shared: Index,
-    unplaced: dict[str, str],
     faults: dict[str, str],
 ) -> str:
     """Explain why no two cameras could be placed.
@@ -647,15 +646,14 @@ def explain_failure(
         names: of the C cameras.
         counts: their frames with the wand.
         shared: (C, C) frame sets that two cameras share.
-        unplaced: the reason, by name of each camera.
-        faults: of these, what is wrong with a camera itself.
+        faults: what is wrong with a camera itself, by its name.
     """
     if faults:
         reasons = "; ".join(f"camera '{name}': {fault}" for name, fault in faults.items())
         return f"no two cameras could be placed: {reasons}"
     pairs = np.triu(shared, 1)
+    frames = ", ".join(f"{name} {n}" for name, n in zip(names, counts, strict=True))
     if not pairs.any():
-        frames = ", ".join(f"{name} {n}" for name, n in zip(names, counts, strict=True))
         return (
             f"no two cameras ever saw the wand at once (frames with the wand: {frames}); wave the wand where views "
             "overlap"
@@ -667,5 +665,8 @@ def explain_failure(
             f"{pairs.max()} times: their detections do not fit a wand with these markers; measure the wand, and check "
             "the intrinsics of the cameras"
         )
-    reasons = "; ".join(f"camera '{name}': {reason}" for name, reason in unplaced.items())
-    return f"no two cameras could be placed; wave the wand where two cameras see it at once ({reasons})"
+    return (
+        f"no two cameras saw the wand at once in {MIN_FRAME_SETS} frame sets or more, at the most in {pairs.max()} "
+        f"(frames with the wand: {frames}); if it was waved, wave it where views overlap, and check the diameter and "
+        "the markers of the wand file"
+    )

@@ -94,7 +94,8 @@ def _label(
     """Label the detections of the camera and of all placed cameras."""
     if name not in rig.cameras:
         raise CalibrationError(
-            f"camera '{name}' is not in the rig; run roundel calibrate intrinsics --camera {name}"
+            f"camera '{name}' is not in the rig, which has {', '.join(sorted(rig.cameras))}; correct the name, or run "
+            f"roundel calibrate intrinsics --camera {name}"
         )
     used = set(rig.placed()) | {name}
     messages = [message for message in messages if message.camera in used]

@@ -21,8 +21,9 @@ from camera_node.foundation.supervisor import Supervisor
 from camera_node.foundation.terminal import console, progress_console, say
 from camera_node.protocol.server_connection import FoundArena, choose_arena, find_arenas
 from camera_node.sources.camera_description import CameraDescription, Mode
-from camera_node.sources.drivers import all_cameras, local_cameras
+from camera_node.sources.drivers import all_cameras, identify, local_cameras
 from camera_node.sources.frame import SourceSettings, without_credentials
+from camera_node.sources.recorded_frames import FrameFolder
 
 TICK_S = 0.25
 MAX_CHECK_S = 3600.0
@@ -90,6 +91,11 @@ class JoinArena:
         self.relative.check()
         if self.zenoh is not None and not (self.connect or self.listen):
             raise ConfigError("--zenoh needs --connect: a protected server is not found by scouting")
+        self.settings.check()
+        for source in self.source:
+            identify(source)  # before a server is looked for
+            if Path(source).is_dir():
+                FrameFolder(Path(source))
         if not self.source and not local_cameras():
             raise CameraAbsentError(
                 "this machine has no camera; plug one in, or give --source (roundel camera --list shows them)"

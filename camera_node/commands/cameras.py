@@ -33,6 +33,8 @@ def cameras(
         arguments: as the action needs them.
         connection: the arena's server.
     """
+    if action == "rename" and len(arguments) == 2:
+        require_name(arguments[1], "a camera")
     if len(arguments) not in N_ARGUMENTS[action]:
         raise ConfigError(f"{len(arguments)} arguments; use roundel cameras {action} {USES[action]}".rstrip())
     with connection.open() as session:
@@ -46,6 +48,8 @@ def cameras(
             if action == "list"
             else change_camera(session, connection.arena, _change(action, arguments))
         )
+    if not registered:
+        say("no camera is registered; roundel camera on its machine adds one")
     for name, camera in registered.items():
         say(_line(name, camera))
     return 0

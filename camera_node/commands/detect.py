@@ -18,10 +18,10 @@ from camera_node.detection.overlay import draw_refused, draw_roundels
 from camera_node.detection.refusals import RefusedRing, explain
 from camera_node.detection.roundels import Roundel, Roundels
 from camera_node.foundation.arrays import Grey
-from camera_node.foundation.errors import CameraError, ConfigError
+from camera_node.foundation.errors import CameraError, ConfigError, describe_failed_write
 from camera_node.foundation.terminal import console, say
 from camera_node.geometry.lens import Lens, load_lens
-from camera_node.sources.recorded_frames import read_grey
+from camera_node.sources.recorded_frames import inner_folders, read_grey
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")  # of the pictures of a folder
 PASSES = 2  # over a picture: the first one learns prints and tone curve
@@ -70,13 +70,18 @@ class Detect:
         if not paths:
             raise ConfigError("no image given; name PNG or JPEG files, or folders of them")
         if self.draw and len(paths) > 1:
-            _make_folder(self.draw)
+            _make_folder(self.draw, len(paths))
         for path in paths:
             self._inspect(path, lens, one_of=len(paths))
         return 0
 
     def _inspect(self, path: Path, lens: Lens | None, one_of: int) -> None:
         image = read_grey(path)
+        if lens is not None and (size := image.shape[::-1]) != (lens.width, lens.height):
+            raise ConfigError(
+                f"{path} has {size[0]} x {size[1]} pixels, the lens of '{self.name}' in {self.rig} is for "
+                f"{lens.width} x {lens.height}; give pictures of that size, or calibrate the lens at this one"
+            )
         detector, roundels = self._detect(image)
         refused = explain(detector, image, roundels) if self.why else []
         rows = [_describe(roundel) for roundel in roundels]
@@ -130,17 +135,17 @@ def _pictures(paths: tuple[Path, ...]) -> Iterator[Path]:
             continue
         inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES]
         if not inside:
-            raise CameraError(f"{path} has no picture; it needs files such as .png or .jpg")
+            raise CameraError(f"{path} has no picture; {inner_folders(path) or 'it needs files such as .png'}")
         yield from inside
 
 
-def _make_folder(path: Path) -> None:
+def _make_folder(path: Path, n_images: int) -> None:
+    if path.suffix.lower() in SUFFIXES or (path.exists() and not path.is_dir()):
+        raise ConfigError(f"--draw names the file {path}, for {n_images} images; name a folder")
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(
-            f"--draw is {path}, which is no folder; several images need one: name a folder"
-        ) from error
+        raise ConfigError(f"{path} can't be written: {describe_failed_write(error)}") from None
 
 
 def _draw(image: Grey, roundels: Roundels, refused: list[RefusedRing], to: Path) -> None:

@@ -32,6 +32,7 @@ EDGE = re.compile(r"^[│╭╰]\s?|\s*[│╮╯]$", re.MULTILINE)  # of the bo
 RULE = re.compile(r"\n\s*─+\s*\n")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 ENTRY = re.compile(r"^ {4}(\S.*)\n((?: {5,}.*\n?)*)", re.MULTILINE)  # a missing option and its help
+UNION = re.compile(r": no type matching .* '([^']*)' is not a number")
 NUMBER = re.compile(r"(?:invalid literal for int\(\) with base 10|could not convert string to float): (.*)")
 
 
@@ -174,14 +175,13 @@ def parse(kind: Any, prog: str, arguments: Sequence[str], examples: Sequence[str
         ConfigError: an option is unknown, missing or has an invalid value; the message names it and a similar one.
     """
     target = _deferred(kind) if inspect.isfunction(kind) else kind
-    boxes = io.StringIO()
     try:
-        with contextlib.redirect_stderr(boxes):
+        with contextlib.redirect_stderr(io.StringIO()):
             return tyro.cli(target, prog=prog, description=_description(kind, examples), args=arguments)
     except SystemExit as end:
         if not end.code:  # of --help
             raise
-        text = boxes.getvalue()
+    text = _fault(target, prog, arguments)
     known = set(OPTION.findall(_help(target, prog, arguments)))
     raise ConfigError(
         f"{_unknown(arguments, known) or _summary(text)} ({prog} --help lists all options)"
@@ -211,6 +211,20 @@ def _description(kind: Any, examples: Sequence[str]) -> str | None:
     text = inspect.getdoc(kind) or ""
     text = re.split(r"\n(?:Args|Attributes|Returns|Raises):\n", text)[0].strip()
     return "\n".join([text, "", "Examples:", *(f"  {example}" for example in examples)])
+
+
+class _Box(io.StringIO):
+    """tyro draws boxes where the output's encoding has them, and rows of dashes elsewhere, as with `LC_ALL=C`."""
+
+    encoding = "utf-8"
+
+
+def _fault(target: Any, prog: str, arguments: Sequence[str]) -> str:
+    """The box that tyro prints for a mistake in a command line, whatever the terminal's encoding is."""
+    box = _Box()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stderr(box), contextlib.redirect_stdout(box):
+        tyro.cli(target, prog=prog, args=arguments)
+    return box.getvalue()
 
 
 def _help(kind: Any, prog: str, arguments: Sequence[str]) -> str:
@@ -248,7 +262,7 @@ def _summary(text: str) -> str:
         return f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
     line = " ".join(fault.split()).removeprefix("Error parsing ")
     line = re.sub(r"^Unrecognized options: (.*)", r"'\1' was not expected", line)
-    return NUMBER.sub(r"\1 is not a number", line)
+    return UNION.sub(r" '\1' is not a number", NUMBER.sub(r"\1 is not a number", line))
 
 
 def _required(name: str, text: str) -> str:

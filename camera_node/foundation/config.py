@@ -23,6 +23,12 @@ from camera_node.foundation.errors import ConfigError, printable, unwritable
 T = TypeVar("T")
 NAME = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
 NAME_RULE = "use letters, digits, _, . and -, at most 64 characters"
+KINDS = {  # what a file describes, by a key that no file of another kind has at its top
+    "robots": "robots (robots.yaml)",
+    "cameras": "cameras (rig.yaml)",
+    "markers": "one body of roundels (wand.yaml, an L-frame)",
+    "listen": "a server (arena.yaml)",
+}
 MAX_BYTES = 1 << 20  # of a file; 64 cameras with covariances take a tenth of it
 MAX_DEPTH = 32  # nested lists and mappings; no file of this project has more than 6
 MAX_VALUES = 100_000  # about 1 kB of memory each while a file is read
@@ -80,7 +86,16 @@ def load_yaml(path: Path, kind: type[T]) -> T:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         fault = _name_entry(data, kind, str(error))
-        raise ConfigError(f"{path}: {fault}{_suggest(kind, fault)}") from None
+        raise ConfigError(_another_kind(path, data, kind) or f"{path}: {fault}{_suggest(kind, fault)}") from None
+
+
+def _another_kind(path: Path, data: Any, kind: type) -> str:
+    """What a file describes and what it should; empty unless no name at its top is one of a file of this kind."""
+    fields = _fields(msgspec.inspect.type_info(kind), [])
+    if not isinstance(data, dict) or data.keys() & set(fields):
+        return ""
+    described = next((about for key, about in KINDS.items() if key in data), "")
+    return described and f"{path} describes {described}; give a file with {', '.join(fields)}"
 
 
 def _name_entry(data: Any, kind: type, fault: str) -> str:

@@ -20,7 +20,7 @@ log = logging.getLogger("camera_node.network")
 
 REPORT_S = 5.0  # timeout of the query for a router's endpoints
 CONNECT_S = 5.0  # for a server to accept a client
-NO_SERVER = "no server answers at {} within {:g} s; check that roundel server runs there, and check --connect"
+NO_SERVER = "no server answers at {} within {:g} s; start it with roundel up or roundel server, or correct --connect"
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
 # In Zenoh's message, where the operating system refuses an address; otherwise the configuration is invalid.
 SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")
@@ -116,7 +116,8 @@ def open_client(
     try:
         return _open_client(connect, zenoh_config, limits)
     except zenoh.ZError as error:
-        raise NetworkError(f"{NO_SERVER.format(' '.join(connect), timeout_s)} ({_brief(error)})") from None
+        cause = "" if "Timeout" in str(error) else f" ({_brief(error)})"
+        raise NetworkError(NO_SERVER.format(" ".join(connect), timeout_s) + cause) from None
 
 
 def open_endless(

@@ -12,7 +12,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.foundation.errors import CameraError, ConfigError, unwritable
 from camera_node.foundation.terminal import track
 from camera_node.protocol.messages import Detections
-from camera_node.sources.recorded_frames import FrameFolder
+from camera_node.sources.recorded_frames import FrameFolder, inner_folders
 
 SIGMA_PX = 0.3  # assumed standard deviation of a centre from a file without covariances
 MAX_FPS = 1e5
@@ -37,6 +37,11 @@ def detect_frames(folder: Path, **settings) -> list[Detections]:
     if not names:
         raise CameraError(
             f"{folder} contains no camera's folder; frames are expected as {folder}/<camera>/<t_ns>.png"
+        )
+    if nested := [name for name in names if inner_folders(folder / name)]:
+        raise CameraError(
+            f"{folder / nested[0]} has folders in place of frames; give the folder whose folders are the cameras, "
+            f"such as {folder / nested[0]}"
         )
     sources = {name: FrameFolder(folder / name) for name in names}
     frames = ((name, seq, frame) for name, source in sources.items() for seq, frame in enumerate(source))

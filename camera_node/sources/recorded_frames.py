@@ -21,6 +21,12 @@ from camera_node.sources.grey import to_grey
 IMAGES = (".png", ".jpg", ".jpeg")  # suffixes of files that hold one frame
 
 
+def inner_folders(folder: Path) -> str:
+    """The advice to give a folder inside this one; empty if it has none."""
+    names = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    return f"it has folders: give {folder / names[0]}" if names else ""
+
+
 class FrameFolder:
     """A folder of frames `<t_ns>.png|jpg`; iterating yields them in order of time."""
 
@@ -34,7 +40,8 @@ class FrameFolder:
                 f"{folder / min(bad)} is not named by its capture time in nanoseconds; rename it to <t_ns>.png"
             )
         if not files:
-            raise CameraError(f"{folder} holds no frames; they are expected as {folder}/<t_ns>.png or .jpg")
+            where = inner_folders(folder) or f"they are expected as {folder}/<t_ns>.png or .jpg"
+            raise CameraError(f"{folder} holds no frames; {where}")
         self.files = sorted(files, key=lambda path: int(path.stem))
 
     def __len__(self) -> int:

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import ConfigError
+from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
@@ -253,7 +254,7 @@ class RobotDefinition:
         replace: whether it may replace a robot of that name.
 
     Raises:
-        ConfigError: the name can't be one.
+        ConfigError: the name can't be one, or the diameter is not plausible.
     """
 
     name: str
@@ -265,6 +266,10 @@ class RobotDefinition:
 
     def __post_init__(self) -> None:
         require_name(self.name, "a robot")
+        try:
+            Body(diameter_m=self.diameter_m, markers=((0.0, 0.0, 0.0),))
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
 
 
 def define_robot(session: zenoh.Session, arena: str, definition: RobotDefinition, seconds: float) -> Robots:

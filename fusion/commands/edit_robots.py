@@ -63,6 +63,8 @@ def robots(
         save_robots(after.robots, Path(arguments[0]))
         say(f"wrote {len(after.robots)} robots to {arguments[0]}")
         return 0
+    if not after.robots:
+        say("no robot is declared; roundel define NAME measures one")
     for name, robot in after.robots.items():
         say(_line(name, robot, name in after.unsaved))
     for name in sorted(set(after.unsaved) - after.robots.keys()):

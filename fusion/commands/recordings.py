@@ -46,7 +46,10 @@ def recordings(
 def _list(folder: Path) -> None:
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder; name one with recordings")
-    for summary in list_recordings(folder):
+    found = list_recordings(folder)
+    if not found:
+        say(f"no recording (*.mcap) in {folder}; roundel record OUT.mcap makes one")
+    for summary in found:
         say(_line(summary))
 
 

@@ -8,17 +8,18 @@ from camera_node.foundation.terminal import say
 from fusion.recordings.recording_files import say_skipped, trim_recording
 
 
-def trim(recording: Path, out: Path, /, *, from_s: float = 0.0, to_s: float = 1e9) -> int:
+def trim(recording: Path, out: Path, /, *, from_s: float = 0.0, to_s: float = 1e9, force: bool = False) -> int:
     """Copy a part of a recording (MCAP), with the rig and the robots that held at its start.
 
     Args:
         recording: the MCAP file.
-        out: the file to write; it must not exist.
+        out: the file to write.
         from_s: start of the part, seconds after the first message.
         to_s: end of the part, seconds after the first message.
+        force: replace what exists.
     """
     faults = Counter[str]()
-    count = trim_recording(recording, out, from_s, to_s, faults)
+    count = trim_recording(recording, out, from_s, to_s, faults, overwrite=force)
     say_skipped(faults)
     say(f"wrote {out}: {count} messages")
     return 0

@@ -57,6 +57,17 @@ def _hidden_path(path: Path) -> Iterator[Path]:
         _remove(part)
 
 
+def require_suffix(path: Path, *suffixes: str) -> None:
+    """Raise ConfigError for the name of a file that does not end in one of the suffixes."""
+    if path.suffix.lower() not in suffixes:
+        names = " or ".join(suffixes)
+        raise ConfigError(
+            f"--out {path} does not end in {names}; write {path.stem}.mcap, which roundel export converts"
+            if ".mcap" in suffixes
+            else f"--out {path} does not end in {names}"
+        )
+
+
 def write_csv(poses: Iterable[RobotPose], path: Path) -> None:
     """Write all poses, with those of lost robots, with `COLUMNS`.
 

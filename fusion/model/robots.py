@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from camera_node.foundation.arrays import Array
-from camera_node.foundation.config import NAME_RULE, dump_yaml, is_name, load_yaml, write_atomically
+from camera_node.foundation.config import NAME_RULE, dump_yaml, example_file, is_name, load_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError, printable
 from camera_node.geometry.body import Body
 from fusion.errors import FusionError
@@ -124,7 +124,7 @@ def load_robots(path: Path) -> dict[str, Robot]:
     """
     robots = load_saved_robots(path)
     if not robots:
-        raise ConfigError(f"{path} declares no robot; see configs/robots.yaml for an example")
+        raise ConfigError(f"{path} declares no robot; {example_file('robots.yaml')} is an example")
     return robots
 
 

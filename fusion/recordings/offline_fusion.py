@@ -21,6 +21,7 @@ from calib.rig.rig import load_rig
 from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.recorded_detections import detect_frames, read_observations
+from fusion.errors import FusionError
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot, load_robots
@@ -80,6 +81,7 @@ class Summary:
     unlabeled: int = 0
     faults: Counter[str] = field(default_factory=Counter)
     moves: list[str] = field(default_factory=list)
+    not_acquired: dict[str, str] = field(default_factory=dict)
 
     def add(self, fused: TrackingResult) -> None:
         """Count a fused frame set."""
@@ -105,7 +107,8 @@ class Summary:
         yield f"{self.frame_sets} frame sets, {self.unlabeled} unlabeled markers"
         for robot in robots:
             shares = (f"{s} {self.states[robot, s] / max(self.frame_sets, 1):.1%}" for s in STATES)
-            yield f"{robot}: {', '.join(shares)}"
+            why = f"; at the end: {self.not_acquired[robot]}" if robot in self.not_acquired else ""
+            yield f"{robot}: {', '.join(shares)}{why}"
         for name in sorted(self.used):
             rms = np.sqrt(self.squared_px[name] / self.used[name]) if self.used[name] else np.nan
             yield (
@@ -125,6 +128,9 @@ def fuse_recording(
         messages: when each message of a camera arrived (ns), and the message, in order of arrival.
         arena: its cameras and robots.
         summary: counts the results, the skipped messages and the moved cameras.
+
+    Raises:
+        FusionError: no frame could be used.
     """
     summary = Summary() if summary is None else summary
     tracker = Tracker(arena.cameras, arena.robots, arena.limits)
@@ -162,6 +168,10 @@ def _fuse(
             yield from smoother.add(fused)
         for correction in tracker.check_extrinsics(frame_set, fused):
             summary.add_correction(correction, frame_set.t_ns)
+    summary.not_acquired = tracker.not_acquired()
+    if not summary.frame_sets:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in summary.faults.most_common())
+        raise FusionError(f"no frame could be used{f' (skipped: {reasons})' if reasons else ''}; nothing was written")
     if smoother is not None:
         yield from smoother.finish()
 

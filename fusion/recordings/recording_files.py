@@ -121,7 +121,12 @@ def say_skipped(faults: Counter[str]) -> None:
 
 
 def trim_recording(
-    recording: Path, out: Path, from_s: float, to_s: float, faults: Counter[str] | None = None
+    recording: Path,
+    out: Path,
+    from_s: float,
+    to_s: float,
+    faults: Counter[str] | None = None,
+    overwrite: bool = False,
 ) -> int:
     """Write the messages that arrived from `from_s` to `to_s` after the first one, and what held at `from_s`: the
     rig, the robots and the states of the cameras and the server. `faults` counts what could not be read.
@@ -130,16 +135,20 @@ def trim_recording(
         the number of messages in the part.
 
     Raises:
-        ConfigError: no message is in the part, the recording can't be read, or `out` exists or can't be written.
+        ConfigError: no message is in the part, the recording can't be read or is `out`, or `out` exists without `overwrite` or
+            can't be written.
     """
+    if out.exists() and recording.exists() and out.samefile(recording):
+        raise ConfigError(f"{out} is the recording itself; give another file")
     if not 0 <= from_s < to_s:
         raise ConfigError(f"a part from {from_s:g} s to {to_s:g} s is empty; give --from-s below --to-s")
     faults = Counter[str]() if faults is None else faults
-    start_ns = min((t_ns for *_, t_ns in read_messages(recording, faults)), default=0)
+    times = [t_ns for *_, t_ns in read_messages(recording, faults)] or [0]
+    start_ns, length_s = min(times), (max(times) - min(times)) / 1e9
     begin_ns, end_ns = (start_ns + round(s * 1e9) for s in (from_s, min(to_s, 1e9)))
     context: dict[str, bytes] = {}
     n_written = 0
-    with RecordingWriter(out, overwrite=False) as writer:
+    with RecordingWriter(out, overwrite=overwrite) as writer:
         for key, data, t_ns in read_messages(recording, faults):
             if t_ns < begin_ns and key.endswith(CONTEXT):
                 context[key] = data
@@ -152,5 +161,5 @@ def trim_recording(
             n_written += 1
     if not n_written:
         out.unlink()
-        raise ConfigError(f"{recording} has no message from {from_s:g} s to {to_s:g} s after its start")
+        raise ConfigError(f"{recording} has no message after {from_s:g} s; it is {length_s:.1f} s long")
     return n_written

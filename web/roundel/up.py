@@ -56,10 +56,10 @@ class RunArena:
 
     def run(self) -> int:
         """Run until stopped; return the exit code."""
-        folder = ArenaFolder(self.folder)
-        is_new = folder.create(self.arena or LOCAL_SERVER.arena, self.listen, self.local)
         if not self.headless:
             check_port(self.host, self.port)
+        folder = ArenaFolder(self.folder)
+        is_new = folder.create(self.arena or LOCAL_SERVER.arena, self.listen, self.local)
         config = load_arena(folder.config)
         if self.arena not in (None, config.arena):
             raise ConfigError(
