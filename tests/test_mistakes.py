@@ -131,9 +131,7 @@ REMEDIES = (
 )
 
 
-def test_the_remedies_work(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_the_remedies_work(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """What the answers advise, in the folder in which the mistakes were made."""
     monkeypatch.chdir(folder)
     for command in REMEDIES:

@@ -94,7 +94,9 @@ class PlanArena:
     def _check_files(self) -> None:
         """Raise ConfigError for options that contradict each other, and for files that can't be written."""
         if self.plan is None and self.rig is None:
-            raise ConfigError(f"give a plan such as {example_file('plan.yaml')}, or --rig with a calibrated rig")
+            raise ConfigError(
+                f"give a plan such as {example_file('plan.yaml')}, or --rig with a calibrated rig"
+            )
         if self.rig is not None and self.suggest is not None:
             raise ConfigError("--suggest places new cameras, --rig evaluates mounted ones; give one of them")
         if self.suggest is not None and not 1 <= self.suggest <= MAX_CAMERAS:

@@ -135,7 +135,9 @@ def _pictures(paths: tuple[Path, ...]) -> Iterator[Path]:
             continue
         inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES]
         if not inside:
-            raise CameraError(f"{path} has no picture; {inner_folders(path) or 'it needs files such as .png'}")
+            raise CameraError(
+                f"{path} has no picture; {inner_folders(path) or 'it needs files such as .png'}"
+            )
         yield from inside
 
 

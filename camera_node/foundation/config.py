@@ -86,7 +86,9 @@ def load_yaml(path: Path, kind: type[T]) -> T:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         fault = _name_entry(data, kind, str(error))
-        raise ConfigError(_another_kind(path, data, kind) or f"{path}: {fault}{_suggest(kind, fault)}") from None
+        raise ConfigError(
+            _another_kind(path, data, kind) or f"{path}: {fault}{_suggest(kind, fault)}"
+        ) from None
 
 
 def _another_kind(path: Path, data: Any, kind: type) -> str:

@@ -20,7 +20,9 @@ log = logging.getLogger("camera_node.network")
 
 REPORT_S = 5.0  # timeout of the query for a router's endpoints
 CONNECT_S = 5.0  # for a server to accept a client
-NO_SERVER = "no server answers at {} within {:g} s; start it with roundel up or roundel server, or correct --connect"
+NO_SERVER = (
+    "no server answers at {} within {:g} s; start it with roundel up or roundel server, or correct --connect"
+)
 PATIENCE_S = 3.0  # time without a server after which its absence is logged
 # In Zenoh's message, where the operating system refuses an address; otherwise the configuration is invalid.
 SYSTEM_ERROR = re.compile(r"os error \d+|failed to lookup address")

@@ -8,7 +8,9 @@ from camera_node.foundation.terminal import say
 from fusion.recordings.recording_files import say_skipped, trim_recording
 
 
-def trim(recording: Path, out: Path, /, *, from_s: float = 0.0, to_s: float = 1e9, force: bool = False) -> int:
+def trim(
+    recording: Path, out: Path, /, *, from_s: float = 0.0, to_s: float = 1e9, force: bool = False
+) -> int:
     """Copy a part of a recording (MCAP), with the rig and the robots that held at its start.
 
     Args:

@@ -16,7 +16,14 @@ import msgspec
 import numpy as np
 
 from camera_node.foundation.arrays import Array
-from camera_node.foundation.config import NAME_RULE, dump_yaml, example_file, is_name, load_yaml, write_atomically
+from camera_node.foundation.config import (
+    NAME_RULE,
+    dump_yaml,
+    example_file,
+    is_name,
+    load_yaml,
+    write_atomically,
+)
 from camera_node.foundation.errors import ConfigError, printable
 from camera_node.geometry.body import Body
 from fusion.errors import FusionError

@@ -171,7 +171,9 @@ def _fuse(
     summary.not_acquired = tracker.not_acquired()
     if not summary.frame_sets:
         reasons = ", ".join(f"{count} {reason}" for reason, count in summary.faults.most_common())
-        raise FusionError(f"no frame could be used{f' (skipped: {reasons})' if reasons else ''}; nothing was written")
+        raise FusionError(
+            f"no frame could be used{f' (skipped: {reasons})' if reasons else ''}; nothing was written"
+        )
     if smoother is not None:
         yield from smoother.finish()
 

@@ -43,7 +43,9 @@ class ActiveRobots:
             return load_saved_robots(given) if given.exists() else {}
         if self._saved is None or not self._saved.exists():
             if not given.exists():
-                raise ConfigError(f"{given} does not exist; give --robots, or run roundel up, which needs no file")
+                raise ConfigError(
+                    f"{given} does not exist; give --robots, or run roundel up, which needs no file"
+                )
             return load_robots(given)
         self._is_superseded = was_changed_since(given, self._saved)
         if self._is_superseded:

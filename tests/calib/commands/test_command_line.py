@@ -244,7 +244,7 @@ def test_intrinsics_refuse_invalid_boards_and_images(tmp_path: Path):
     (tmp_path / "cam0").mkdir()
     cv2.imwrite(str(tmp_path / "cam0" / "1.png"), np.zeros((40, 60), np.uint8))
     done = calib("intrinsics", "--frames", tmp_path, "--board", "charuco:5x4:0.05", *out)
-    assert (done.returncode, "the board is in 0 of 1 frames" in done.stderr) == (2, True)
+    assert (done.returncode, "the board is in no image" in done.stderr) == (2, True)
     (tmp_path / "cam0" / "2.png").write_text("no image")
     done = calib("intrinsics", "--frames", tmp_path, "--board", "charuco:5x4:0.05", *out)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
@@ -261,6 +261,6 @@ def test_one_bad_camera_does_not_discard_the_other_lenses(tmp_path: Path):
     out = tmp_path / "rig.yaml"
     done = calib("intrinsics", "--frames", tmp_path / "frames", "--board", SPEC, "--out", out)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert "camera 'bad': the board is in 0 of 16 frames" in done.stderr
+    assert "camera 'bad': the board is in no image" in done.stderr
     assert "written without it: good" in done.stderr
     assert list(load_rig(out).cameras) == ["good"]
