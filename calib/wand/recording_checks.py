@@ -38,7 +38,8 @@ def check_cameras(rig: Rig, messages: Sequence[Detections], of: str) -> None:
     if unknown := sorted({message.camera for message in messages} - set(rig.cameras)):
         raise CalibrationError(
             f"camera '{unknown[0]}' of {of} is not in the rig, which has "
-            f"{', '.join(sorted(rig.cameras))}; run roundel calibrate intrinsics --camera {unknown[0]}"
+            f"{', '.join(sorted(rig.cameras))}; name it as there, or run roundel calibrate intrinsics --camera "
+            f"{unknown[0]}"
         )
 
 

@@ -4,6 +4,7 @@
 from collections import Counter
 from pathlib import Path
 
+from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from fusion.recordings.recording_files import say_skipped, trim_recording
 
@@ -20,6 +21,8 @@ def trim(
         to_s: end of the part, seconds after the first message.
         force: replace what exists.
     """
+    if out.exists() and recording.exists() and out.samefile(recording):
+        raise ConfigError(f"{out} is the recording itself; give another file")
     faults = Counter[str]()
     count = trim_recording(recording, out, from_s, to_s, faults, overwrite=force)
     say_skipped(faults)

@@ -135,11 +135,9 @@ def trim_recording(
         the number of messages in the part.
 
     Raises:
-        ConfigError: no message is in the part, the recording can't be read or is `out`, or `out` exists without `overwrite` or
-            can't be written.
+        ConfigError: no message is in the part, the recording can't be read, or `out` exists and is not to be
+            replaced, or can't be written.
     """
-    if out.exists() and recording.exists() and out.samefile(recording):
-        raise ConfigError(f"{out} is the recording itself; give another file")
     if not 0 <= from_s < to_s:
         raise ConfigError(f"a part from {from_s:g} s to {to_s:g} s is empty; give --from-s below --to-s")
     faults = Counter[str]() if faults is None else faults
