@@ -30,6 +30,8 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
     Attributes:
         T_world_cam: the pose; None before the camera is calibrated.
         time_offset_ms: true capture time = stamp + offset.
+        time_drift_ppm, time_reference_ns: of stamps that no server synchronises, as of videos with another rate than
+            stated: the offset grows by this from the reference, a stamp (`capture_ns`).
         readout_us: time in which a rolling shutter reads all rows, microseconds, negative from the last to the first:
             the row at height h of the image (`image_row`) is captured h readout times later. None: as the camera says.
         covariance: (6, 6) of the pose in GTSAM's tangent order (rotation, then translation, both in the camera's
@@ -39,6 +41,8 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
 
     T_world_cam: Pose | None = None
     time_offset_ms: float = 0.0
+    time_drift_ppm: float = 0.0
+    time_reference_ns: int = 0
     readout_us: float | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
     lens_sigma: tuple[float, ...] | None = None
@@ -60,6 +64,17 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
         uv = np.asarray(uv, float).reshape(-1, 2)
         inside = (uv >= -0.5) & (uv < [self.width - 0.5, self.height - 0.5])
         return inside[:, 0] & inside[:, 1]
+
+    @property
+    def clock(self) -> tuple[float, float, int]:
+        """The offset, the drift and the reference of the stamps."""
+        return self.time_offset_ms, self.time_drift_ppm, self.time_reference_ns
+
+    def capture_ns(self, t_ns: int, clock_error_us: float = 0.0) -> int:
+        """The true capture time of a stamp, ns. A clock that states a bound of its error is kept by a server, so the
+        drift of a recording does not hold for it."""
+        since_ns = 0 if clock_error_us > 0 else t_ns - self.time_reference_ns
+        return t_ns + round(1e6 * self.time_offset_ms + 1e-6 * self.time_drift_ppm * since_ns)
 
     def readout_s(self, stated_us: float) -> float:
         """The readout time, s: the calibrated one, or `stated_us`, microseconds, of the camera's own messages."""

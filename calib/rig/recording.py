@@ -191,6 +191,8 @@ def as_they_arrived(
     messages: Iterable[Detections], cameras: Mapping[str, Camera]
 ) -> list[tuple[int, Detections]]:
     """Time of arrival (ns) and message in order, as if each arrived at its true capture time."""
-    offset_ns = {name: round(camera.time_offset_ms * 1e6) for name, camera in cameras.items()}
-    arrivals = [(message.t_ns + offset_ns.get(message.camera, 0), message) for message in messages]
+    arrivals = [
+        (cameras[m.camera].capture_ns(m.t_ns, m.clock_error_us) if m.camera in cameras else m.t_ns, m)
+        for m in messages
+    ]
     return sorted(arrivals, key=lambda arrival: arrival[0])

@@ -30,7 +30,8 @@ MAX_CENTRE = 10.0  # of the principal point, in images' sides: a cropped image m
 MAX_DISTORTION = 1e6
 MAX_POSITION_M = 1e5
 QUATERNION_NORM = (1e-6, 1e6)
-MAX_TIME_OFFSET_MS = 10_000.0  # twenty times the largest offset that a calibration estimates
+MAX_TIME_OFFSET_MS = 86_400_000.0  # a day: recordings of one session
+MAX_TIME_DRIFT_PPM = 1e5  # three times the largest drift that a calibration estimates
 MAX_COVARIANCE = 1e12
 MAX_FIGURES, MAX_DEPTH, MAX_TEXT = 50_000, 8, 10_000  # of the `calibration` map: values, nesting, characters
 
@@ -179,6 +180,8 @@ def _find_fault(camera: Camera) -> str:
         return f"a distortion number is beyond {MAX_DISTORTION:g}"
     if not abs(camera.time_offset_ms) <= MAX_TIME_OFFSET_MS:  # NaN is not
         return f"time_offset_ms must be within {MAX_TIME_OFFSET_MS:g} ms"
+    if not (abs(camera.time_drift_ppm) <= MAX_TIME_DRIFT_PPM and 0 <= camera.time_reference_ns < 2**63):
+        return f"time_drift_ppm must be within {MAX_TIME_DRIFT_PPM:g}, and time_reference_ns a stamp"
     if not abs(camera.readout_us or 0.0) <= MAX_READOUT_US:
         return f"readout_us must be within {MAX_READOUT_US:g}"
     return _find_fault_of_pose(camera)

@@ -125,7 +125,7 @@ def describe_change(before: Rig | None, after: Rig) -> str:
     parts += _name_some("{} not placed", sorted(old.keys() - new.keys() - set(renamed.values())))
     now, then = after.cameras, before.cameras
     parts += _name_some("lens of {}", [name for name in both if _lens(now[name]) != _lens(then[name])])
-    offsets = [name for name in both if now[name].time_offset_ms != then[name].time_offset_ms]
+    offsets = [name for name in both if now[name].clock != then[name].clock]
     parts += _name_some("clock offset of {}", offsets)
     return ", ".join(parts) or "the same poses"
 

@@ -17,10 +17,12 @@ from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig
 from calib.rig.wand_file import check_diameter
+from calib.wand.alignment import align_clocks
 from calib.wand.bundle_adjustment.covariance import estimate_lens_priors, inflate_covariance
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.optimizer import adjust, optimize, optimize_robustly
 from calib.wand.bundle_adjustment.problem import (
+    SLEWED_DRIFT,
     Adjusted,
     Estimate,
     State,
@@ -28,7 +30,7 @@ from calib.wand.bundle_adjustment.problem import (
 )
 from calib.wand.bundle_adjustment.problem_setup import add_background, build_problem
 from calib.wand.clock_model import ClockModel, choose_clocks, clock_candidates, find_jump, with_readout_times
-from calib.wand.conclusion import Placement, Solution, conclude
+from calib.wand.conclusion import Placement, Solution, conclude, with_aligned_clocks
 from calib.wand.detections import (
     MIN_COINCIDENT,
     WandRecording,
@@ -110,24 +112,74 @@ def calibrate(
     check_diameter(wand, messages)
     if distance is not None:
         distance.check(list(rig.cameras))
+    given = _Recorded(messages, background, synchronous)
     try:
-        return _calibrate(rig, wand, messages, distance, synchronous, background)
+        return _calibrate_by_any_clocks(rig, wand, given, distance)
     except CalibrationError:
         if difference := explain_wand(rig, wand, messages):
             raise CalibrationError(difference) from None
         raise
 
 
-def _calibrate(
-    rig: Rig,
-    wand: Body,
-    messages: Sequence[Detections],
-    distance: Distance | None,
-    synchronous: bool,
-    background: Sequence[Detections],
+def _calibrate_by_any_clocks(
+    rig: Rig, wand: Body, given: "_Recorded", distance: Distance | None
 ) -> WandCalibration:
+    """Calibrate with the clocks as they are, or aligned by the motion if that places more cameras."""
+    try:
+        result = _calibrate(rig, wand, given, distance)
+    except CalibrationError:
+        if (aligned := _calibrate_aligned(rig, wand, given, distance)) is None:
+            raise
+        return aligned
+    if not _suspects_clocks(result):
+        return result
+    aligned = _calibrate_aligned(rig, wand, given, distance)
+    return aligned if aligned is not None and len(aligned.names) >= len(result.names) else result
+
+
+@dataclass(frozen=True, slots=True)
+class _Recorded:
+    """A recording, points beside the wand, and whether its user declares it synchronous."""
+
+    messages: Sequence[Detections]
+    background: Sequence[Detections]
+    synchronous: bool
+
+
+def _suspects_clocks(result: WandCalibration) -> bool:
+    """Whether cameras that saw the wand are not placed, or clocks drift as no clock of a computer does."""
+    seen = [name for name, why in result.report.unplaced.items() if why != NOT_RECORDED]
+    return bool(seen) or bool((np.abs(result.adjusted.state.clocks[:, 1]) > SLEWED_DRIFT).any())
+
+
+def _calibrate_aligned(
+    rig: Rig, wand: Body, given: _Recorded, distance: Distance | None
+) -> WandCalibration | None:
+    """Calibrate with the clocks aligned by the motion; None where they do not differ, or still no rig is found.
+
+    Raises:
+        CalibrationError: the clocks of cameras that are declared synchronous differ.
+    """
+    alignment = align_clocks(rig, wand, given.messages)
+    if not alignment.maps:
+        return None
+    if given.synchronous:
+        raise CalibrationError(
+            f"the cameras are declared synchronous, but of {alignment.sentence()}; leave out --synchronised: then the "
+            "offsets are estimated"
+        )
+    aligned = _Recorded(alignment.apply(given.messages), alignment.apply(given.background), False)
+    try:
+        result = _calibrate(rig, wand, aligned, distance)
+    except CalibrationError as error:
+        raise CalibrationError(f"of {alignment.sentence()}; with these clocks: {error}") from None
+    return with_aligned_clocks(result, alignment, alignment.start_s(given.messages))
+
+
+def _calibrate(rig: Rig, wand: Body, given: _Recorded, distance: Distance | None) -> WandCalibration:
     """Raises CalibrationError as `calibrate`, of a recording that fits the rig."""
-    recording, timing = label_by_timing(rig, wand, messages, synchronous)
+    messages, background = given.messages, given.background
+    recording, timing = label_by_timing(rig, wand, messages, given.synchronous)
     start_ns = min(message.t_ns for message in messages)
     lenses = [rig.cameras[name] for name in recording.names]
     beside = gather_background(background, recording.names, lenses, start_ns)

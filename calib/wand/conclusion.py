@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT, Camera
 from calib.rig.rig import Rig
+from calib.wand.alignment import Alignment, ClockMap
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance, parameter_sigma
 from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations, gauge_directions
 from calib.wand.bundle_adjustment.residuals import point_residuals
@@ -97,6 +98,40 @@ def conclude(rig: Rig, solution: Solution, placement: Placement, jump: ClockJump
         readout_ms=readout + 1e3 * adjusted.problem.readout_s,
         readout_sigma_ms=readout_sigma,
         jump=jump,
+    )
+
+
+def with_aligned_clocks(result: WandCalibration, alignment: Alignment, start_s: float) -> WandCalibration:
+    """The result of a recording with aligned stamps, for the stamps as they were: offsets at the alignment's reference
+    and rates, which are stored for each camera, because offsets alone hold at one time only.
+
+    Args:
+        result: of the aligned stamps.
+        alignment: of the clocks.
+        start_s: first aligned stamp, seconds after the reference.
+    """
+    offset_s, rate, cameras = [], [], dict(result.rig.cameras)
+    middle_s = result.adjusted.problem.middle_s + start_s
+    for k, name in enumerate(result.names):
+        found = alignment.maps.get(name, ClockMap(0.0, 0.0))
+        fine_s, drift = result.time_offset_ms[k] * 1e-3, result.drift_ppm[k] * 1e-6
+        offset_s.append(found.offset_s + fine_s + drift * (found.offset_s - middle_s))
+        rate.append((1 + found.rate) * (1 + drift) - 1)
+    offset_ms = 1e3 * (np.array(offset_s) - np.median(offset_s))
+    for k, name in enumerate(result.names):
+        cameras[name] = msgspec.structs.replace(
+            cameras[name],
+            time_offset_ms=float(offset_ms[k]),
+            time_drift_ppm=1e6 * rate[k],
+            time_reference_ns=alignment.reference_ns,
+        )
+    report = replace(result.report, timing=f"{result.report.timing}; of {alignment.sentence()}")
+    return replace(
+        result,
+        rig=msgspec.structs.replace(result.rig, cameras=cameras),
+        report=report,
+        time_offset_ms=offset_ms,
+        drift_ppm=1e6 * np.array(rate),
     )
 
 

@@ -64,6 +64,11 @@ class FrameTable:
     t_s: Array
     readout_s: Array
 
+    def select_camera(self, camera: int) -> "FrameTable":
+        """Return the frames of one camera."""
+        mine = self.camera == camera
+        return FrameTable(self.camera[mine], self.t_s[mine], self.readout_s[mine])
+
     def period_s(self) -> float:
         """Return the median time between consecutive frames of a camera, seconds; 0 if no camera has two."""
         steps = np.diff(self.t_s)[(np.diff(self.camera) == 0) & (np.diff(self.t_s) > 0)]

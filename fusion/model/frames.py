@@ -49,7 +49,7 @@ class CalibratedFrame:
         """The frame of a message from a calibrated camera."""
         return cls.measure(
             message.camera,
-            message.t_ns + round(camera.time_offset_ms * 1e6),
+            camera.capture_ns(message.t_ns, message.clock_error_us),
             message.unpack(),
             camera,
             stamp_ns=message.t_ns,
@@ -70,7 +70,8 @@ class CalibratedFrame:
 
     def recalibrated(self, old: Camera, new: Camera) -> "CalibratedFrame":
         """The frame by another calibration of its camera."""
-        shift_ns = round((new.time_offset_ms - old.time_offset_ms) * 1e6)
+        stamp_ns = self.stamp_ns or self.t_ns
+        shift_ns = new.capture_ns(stamp_ns) - old.capture_ns(stamp_ns)
         xy, scale = undistort(new, self.roundels)
         return replace(self, t_ns=self.t_ns + shift_ns, xy=xy, scale=scale)
 

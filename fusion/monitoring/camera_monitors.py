@@ -76,7 +76,7 @@ class CameraMonitors:
 
     def place(self, name: str, camera: Camera, pinned: bool) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
-        if camera.time_offset_ms != self._cameras[name].time_offset_ms:
+        if camera.clock != self._cameras[name].clock:
             self.clocks.reset(name)
         self._cameras.place(name, camera)
         (self.extrinsics.pin if pinned else self.extrinsics.readmit)(name)

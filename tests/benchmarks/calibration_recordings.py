@@ -62,9 +62,7 @@ def _tracks(camera: Camera, name: str, messages: list[Detections]):
         if message.camera == name:
             seen = message.unpack()
             for corner, uv in zip(seen.id.tolist(), seen.uv, strict=True):
-                rows.setdefault(corner, []).append(
-                    (message.t_ns * 1e-9 + camera.time_offset_ms * 1e-3, *uv.tolist())
-                )
+                rows.setdefault(corner, []).append((camera.capture_ns(message.t_ns) * 1e-9, *uv.tolist()))
     tables = {corner: np.array(sorted(table)) for corner, table in rows.items()}
     return {corner: (table[:, 0], camera.normalise(table[:, 1:])) for corner, table in tables.items()}
 

@@ -58,7 +58,7 @@ def test_hostile_json_is_refused(text: str):
         parse_request(text.encode(), RigRequest)
 
 
-@pytest.mark.parametrize("offset", [".nan", ".inf", "1.0e+308", "-20000.0"])
+@pytest.mark.parametrize("offset", [".nan", ".inf", "1.0e+308", "-2.0e+8"])
 def test_an_implausible_offset_in_a_file_is_refused(tmp_path, offset: str):
     text = dump_rig(RIG).replace("  cam0:", f"  cam0:\n    time_offset_ms: {offset}")
     (tmp_path / "rig.yaml").write_text(text)

@@ -1,0 +1,396 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Clocks of cameras that differ by seconds or minutes, or run at other rates: found by correlation, before any lens.
+
+Two affine cameras see the same motion if one linear combination of the image velocity in the first equals one in the
+second: at the right shift and rate of the clocks, the largest canonical correlation (Hotelling 1936) of the two
+velocities is near 1, whatever the cameras' poses, lenses and mirrored images. For a trial rate, the moments at all
+shifts are correlations by FFT. A wrong shift has a correlation by chance: n independent samples give
+-n log(1 - r^2), about chi-square of 4 degrees (Bartlett 1938), with n reduced by the autocorrelation of both (Bartlett
+1946). docs/design/wand_adjustment.md, section 8.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.rig.rig import Rig
+from calib.wand.bundle_adjustment.problem import SLEWED_DRIFT
+from calib.wand.detections import FrameTable, MarkerTrack, Timing, WandDetections, gather
+from calib.wand.initial_rig import MAX_SHIFT_S, SHIFT_SAMPLE, epipolar_misfits, spread_evenly
+from camera_node.foundation.arrays import Array
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
+
+GRID_S, STEP_S = (
+    1 / 30,
+    0.1,
+)  # time between samples, and over which velocities are averaged: a hand moves below 2 Hz
+GROSS = 5.0  # times the median: larger velocities are outliers
+MAX_RATE = 0.03  # by which two clocks may differ: 29.97 frames a second read as 30 or 29, 24 as 25 is beyond
+CHANCE = 1e-4  # probability of a false alignment, over all shifts and rates
+MAX_TRACKS = 8  # markers of which each camera's velocity is used
+OTHERS, MISFIT = 40, 0.25  # shifts that are compared, and the misfit at the right one over the least of these
+FEW = 8.0  # independent samples, which a correlation of two by two coordinates needs
+SLIM = 1e-4  # of the variance, that motion across a line has at the least
+REFINEMENTS, ACROSS = 6, 5  # grids of trial shifts and rates around the best one, each half as wide
+
+Spectrum = NDArray[np.complex128]
+Spectra = tuple[Spectrum, Spectrum, Spectrum]
+
+
+@dataclass(frozen=True, slots=True)
+class ClockMap:
+    """Corrected stamp = stamp + offset + rate (stamp - reference), seconds."""
+
+    offset_s: float
+    rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Maps of the stamps of cameras, by name, into the clock that most cameras share.
+
+    Attributes:
+        reference_ns: stamp at which the offsets hold.
+        maps: of the cameras whose clocks differ by more than an adjustment estimates by itself.
+    """
+
+    reference_ns: int
+    maps: dict[str, ClockMap]
+
+    def start_s(self, messages: Sequence[Detections]) -> float:
+        """The first corrected stamp, seconds after the reference."""
+        return 1e-9 * (min(m.t_ns for m in self.apply(messages)) - self.reference_ns)
+
+    def apply(self, messages: Sequence[Detections]) -> list[Detections]:
+        """The messages with corrected stamps."""
+        return [
+            msgspec.structs.replace(m, t_ns=self._corrected(m.t_ns, found)) if found else m
+            for m in messages
+            for found in [self.maps.get(m.camera)]
+        ]
+
+    def _corrected(self, t_ns: int, found: ClockMap) -> int:
+        return t_ns + round(1e9 * found.offset_s + found.rate * (t_ns - self.reference_ns))
+
+    def sentence(self) -> str:
+        """How the clocks differ."""
+        return "; ".join(f"camera '{name}' {_describe(found)}" for name, found in self.maps.items())
+
+
+def _describe(found: ClockMap) -> str:
+    later = "later" if found.offset_s < 0 else "earlier"
+    shift = f"the stamps are {abs(found.offset_s):.1f} s {later} than those of the others"
+    fast = "fast" if found.rate < 0 else "slow"
+    return f"{shift}, its clock is {1e2 * abs(found.rate):.2f} % too {fast}" if found.rate else shift
+
+
+def align_clocks(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Alignment:
+    """Find clocks that differ by more than an adjustment estimates by itself.
+
+    Clocks of running cameras, which state a bound of their error, are not tried.
+
+    Args:
+        rig: the lenses.
+        wand: its number of markers tells the frames of unnumbered points that show all of it.
+        messages: the recording.
+    """
+    stamps = [m.t_ns for m in messages]
+    reference_ns = (min(stamps) + max(stamps)) // 2
+    if all(m.clock_error_us > 0 for m in messages):
+        return Alignment(reference_ns, {})
+    names = sorted({m.camera for m in messages})
+    frames, detections = gather(messages, names, [rig.cameras[name] for name in names])
+    frames = replace(frames, t_s=frames.t_s - (reference_ns - min(stamps)) * 1e-9)
+    signals = {}
+    for k, name in enumerate(names):
+        signal = _Signal.of(frames, detections.select(detections.camera == k), k, len(wand.markers))
+        if signal is not None:
+            signals[name] = signal
+    return Alignment(reference_ns, _relative_to_most(_chain(signals)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Signal:
+    """The image motion of one camera: tracks by marker, seconds after the reference, and how its frames follow."""
+
+    tracks: dict[int, MarkerTrack]
+    timing: Timing
+
+    @classmethod
+    def of(cls, frames: FrameTable, found: WandDetections, camera: int, markers: int) -> "_Signal | None":
+        """The signal of a camera's detections: of the markers that it sees most, or of the middle of a wand without
+        numbers in the frames that show as many points as it has; None without motion."""
+        t_s, label, xy = frames.t_s[found.frame], found.label, found.xy
+        if not (label >= 0).any():
+            frame, start, count = np.unique(found.frame, return_index=True, return_counts=True)
+            whole = count == markers
+            xy = np.add.reduceat(xy, start)[whole] / markers if len(start) else xy
+            t_s, label = frames.t_s[frame[whole]], np.zeros(int(whole.sum()), np.intp)
+        most = np.argsort(-np.bincount(label[label >= 0], minlength=1))[:MAX_TRACKS]
+        tracks = {}
+        for number in most.tolist():
+            rows = np.flatnonzero(label == number)
+            rows = rows[np.diff(t_s[rows], prepend=-np.inf) > 0]
+            if len(rows) > 1:
+                tracks[number] = MarkerTrack.of(t_s[rows], xy[rows])
+        period_s = frames.select_camera(camera).period_s()
+        return cls(tracks, Timing(period_s)) if tracks and period_s else None
+
+    @property
+    def step_s(self) -> float:
+        """The time over which the image's motion is compared."""
+        return max(self.timing.period_s, STEP_S)
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The first and the last time."""
+        ends = [(t.t_s[0], t.t_s[-1]) for t in self.tracks.values()]
+        return float(min(a for a, _ in ends)), float(max(b for _, b in ends))
+
+    def velocities(self, label: int, t_s: Array, step_s: float) -> Array:
+        """(n, 2) mean velocities of a marker's image over a step around times (n,); 0 where it was not seen."""
+        track, gap_s = self.tracks[label], self.timing.gap_s
+        moved = track.interpolate(t_s + step_s / 2, gap_s) - track.interpolate(t_s - step_s / 2, gap_s)
+        limit = GROSS * np.nanmedian(np.abs(moved)) if np.isfinite(moved).any() else 0.0
+        return np.nan_to_num(np.clip(moved, -limit, limit))
+
+
+@dataclass(frozen=True, slots=True)
+class _Match:
+    """The stamp of b that belongs to a stamp t of a: t (1 + rate) + shift."""
+
+    shift_s: float
+    rate: float
+
+
+def _chain(signals: dict[str, _Signal]) -> dict[str, ClockMap]:
+    """Maps of the cameras into the clock of the one that has the longest tracks, directly or by others: first by clocks
+    that agree, which is soon tested, then by clocks that differ."""
+    order = sorted(signals, key=lambda name: -sum(len(t.t_s) for t in signals[name].tracks.values()))
+    maps = {name: ClockMap(0.0, 0.0) for name in order[:1]}
+    for search in (_agree, _match):
+        reached = list(maps)
+        for a in reached:  # grows
+            for b in [name for name in order if name not in maps]:
+                match = search(signals[a], signals[b])
+                if match is not None:
+                    known, scale = maps[a], 1 / (1 + match.rate)
+                    shift_s = (1 + known.rate) * scale * match.shift_s
+                    maps[b] = ClockMap(known.offset_s - shift_s, (1 + known.rate) * scale - 1)
+                    reached.append(b)
+    return maps
+
+
+def _relative_to_most(maps: dict[str, ClockMap]) -> dict[str, ClockMap]:
+    """The maps into the clock that most cameras share, without those whose clocks are the same."""
+
+    def differs(one: ClockMap, other: ClockMap) -> bool:
+        return (
+            abs(one.offset_s - other.offset_s) > MAX_SHIFT_S / 2 or abs(one.rate - other.rate) > SLEWED_DRIFT
+        )
+
+    if not maps:
+        return {}
+    middle_s = float(np.median([m.offset_s for m in maps.values()]))
+    shared = max(
+        maps.values(),
+        key=lambda m: (sum(not differs(m, o) for o in maps.values()), -abs(m.offset_s - middle_s)),
+    )
+    # c = t + o + r t of the first camera's clock becomes (c - o_s) / (1 + r_s).
+    relative = {
+        name: ClockMap(
+            (m.offset_s - shared.offset_s) / (1 + shared.rate), (1 + m.rate) / (1 + shared.rate) - 1
+        )
+        for name, m in maps.items()
+        if differs(m, shared)
+    }
+    return {
+        name: m if abs(m.rate) > SLEWED_DRIFT else ClockMap(m.offset_s, 0.0) for name, m in relative.items()
+    }
+
+
+def _scales(a: _Signal, b: _Signal) -> tuple[float, float, float]:
+    """Seconds: the grid, the step of the velocities, and the width of their correlation."""
+    grid_s, step_s = max(a.timing.period_s, b.timing.period_s, GRID_S), max(a.step_s, b.step_s)
+    return grid_s, step_s, _width(a, list(a.tracks), grid_s, step_s)
+
+
+def _agree(a: _Signal, b: _Signal) -> _Match | None:
+    """No shift, if two cameras show the same motion at the same stamps, as far as an adjustment finds the rest."""
+    labels = [label for label in a.tracks if label in b.tracks]
+    if not labels:
+        return None
+    scales_s = _scales(a, b)
+    found = _best(list(_trials(a, b, labels, scales_s, (0.0,))), scales_s[2], 0.0)
+    if found is None or abs(found.shift_s) > MAX_SHIFT_S:
+        return None
+    return _Match(0.0, 0.0) if _keeps_rate(a, b, labels, scales_s, found.shift_s) else None
+
+
+def _match(a: _Signal, b: _Signal) -> _Match | None:
+    """The shift and the rate under which two cameras show the same motion; None unless they are certain, and one
+    epipolar geometry confirms them."""
+    labels = [label for label in a.tracks if label in b.tracks]
+    if not labels:
+        return None
+    scales_s = _scales(a, b)
+    span_s = min(float(np.ptp(a.span)), float(np.ptp(b.span)))
+    count = int(np.ceil(MAX_RATE * span_s / scales_s[2]))
+    rates = (np.arange(-count, count + 1) * MAX_RATE / count).tolist()
+    reach_s = max(map(abs, (*a.span, *b.span)))
+    found = _best(list(_trials(a, b, labels, scales_s, rates)), scales_s[2], reach_s)
+    if found is None:
+        return None
+    found = _refine(a, b, labels, scales_s, found)
+    return found if _is_confirmed(a, b, labels[0], found) else None
+
+
+def _is_confirmed(a: _Signal, b: _Signal, label: int, found: _Match) -> bool:
+    """Whether one epipolar geometry fits a marker at a shift far better than at any of many others."""
+    mine, theirs = a.tracks[label], b.tracks[label]
+    rows = spread_evenly(len(mine.t_s), SHIFT_SAMPLE)
+    away = np.linspace(-1, 1, OTHERS) * np.ptp(a.span) / 2
+    shifts = found.shift_s + np.concatenate([[0.0], away[np.abs(away) > MAX_SHIFT_S]])
+    there = theirs.interpolate(mine.t_s[rows] * (1 + found.rate) + shifts[:, None], b.timing.gap_s)
+    here, *others = epipolar_misfits(mine.xy[rows], there).tolist()
+    return here < MISFIT * min(others)
+
+
+def _best(trials: "Sequence[tuple[Array, Array, float]]", width_s: float, reach_s: float) -> _Match | None:
+    """The trial with most evidence; None if that is likely by chance, or if another shift has nearly as much.
+
+    Args:
+        trials: evidence (n,), shifts (n,) and the rate.
+        width_s: time within which the motion is alike.
+        reach_s: longest time from the reference, at which another rate is another shift.
+    """
+    from scipy.special import chdtrc
+
+    evidence, shifts, rate = max(trials, key=lambda trial: trial[0].max())
+    k = int(evidence.argmax())
+    second = max(
+        float(e.max(initial=0.0, where=np.abs(s - shifts[k]) > 4 * width_s + abs(r - rate) * reach_s))
+        for e, s, r in trials
+    )
+    tried = sum(np.ptp(s) / width_s for _, s, _ in trials)
+    by_chance = chdtrc(4, evidence[k]) * tried > CHANCE or evidence[k] - second < -2 * np.log(CHANCE)
+    return None if by_chance else _Match(float(shifts[k]), rate)
+
+
+def _keeps_rate(
+    a: _Signal, b: _Signal, labels: Sequence[int], scales_s: tuple[float, float, float], shift_s: float
+) -> bool:
+    """Whether no other rate of clocks that are nearly alike has more evidence than the same rate."""
+    at, span_s = np.arange(*a.span, scales_s[0]), min(float(np.ptp(a.span)), float(np.ptp(b.span)))
+    mine = [a.velocities(label, at, scales_s[1]) for label in labels]
+    middle = at.mean()
+    found = []
+    for rate in scales_s[2] / span_s * np.arange(-2, 3):
+        theirs = [b.velocities(label, at + shift_s + rate * (at - middle), scales_s[1]) for label in labels]
+        found.append(_direct_evidence(mine, theirs, 1.0))
+    return int(np.argmax(found)) == 2
+
+
+def _width(a: _Signal, labels: Sequence[int], grid_s: float, step_s: float) -> float:
+    """The time within which the motion of a camera's image is alike: the inverse of its bandwidth, 1 / (2 pi f)."""
+    at = np.arange(a.span[0], a.span[1] + grid_s, grid_s)
+    spectra = np.fft.rfft([a.velocities(label, at, step_s) for label in labels], axis=1)
+    power = (np.abs(spectra) ** 2).sum(axis=(0, 2))
+    f = np.fft.rfftfreq(len(at), grid_s)
+    return float(1 / (2 * np.pi * np.sqrt((power @ f**2) / max(power.sum(), 1e-300)) + 1e-9))
+
+
+def _trials(
+    a: _Signal,
+    b: _Signal,
+    labels: Sequence[int],
+    scales_s: tuple[float, float, float],
+    rates: Sequence[float],
+) -> Iterator[tuple[Array, Array, float]]:
+    """The evidence (n,) of shifts (n,), seconds, for each trial rate, and the rate."""
+    (grid_s, step_s, width_s), (first, last), (start, end) = scales_s, a.span, b.span
+    at_a = np.arange(first, last + grid_s, grid_s)
+    size = int(2 ** np.ceil(np.log2(len(at_a) + (end - start) * (1 + MAX_RATE) / grid_s + 2)))
+    f_a = _spectra([a.velocities(label, at_a, step_s) for label in labels], size)
+    for rate in rates:
+        at_b = np.arange(start / (1 + rate), end / (1 + rate) + grid_s, grid_s)
+        f_b = _spectra([b.velocities(label, at_b * (1 + rate), step_s) for label in labels], size)
+        lags = np.fft.fftfreq(size, 1 / size) * grid_s + at_b[0] - at_a[0]
+        yield _evidence(f_a, f_b, size, grid_s / (np.pi * width_s)), lags * (1 + rate), rate
+
+
+def _spectra(velocities: Sequence[Array], size: int) -> Spectra:
+    """Spectra of the velocities (m, 2, f), of their products xx, xy, yy (m, 3, f), and of the mask (m, f)."""
+    v = np.array(velocities) / max(float(np.std(velocities)), 1e-300)
+    products = np.stack([v[..., 0] ** 2, v[..., 0] * v[..., 1], v[..., 1] ** 2], axis=1)
+    mask = (v != 0).any(axis=2).astype(float)
+    return np.fft.rfft(v.swapaxes(1, 2), size), np.fft.rfft(products, size), np.fft.rfft(mask, size)
+
+
+def _evidence(a: Spectra, b: Spectra, size: int, independent: float) -> Array:
+    """(n,) -count log(1 - r^2) of the largest canonical correlation r at all lags of b after a."""
+
+    def correlate(first: Spectrum, second: Spectrum) -> Array:
+        return np.fft.irfft((np.conj(first) * second).sum(axis=0), size)
+
+    count = np.maximum(correlate(a[2], b[2]), 0.0)
+    aa = [correlate(a[1][:, k], b[2]) for k in range(3)]
+    bb = [correlate(a[2], b[1][:, k]) for k in range(3)]
+    ab = np.array([[correlate(a[0][:, i], b[0][:, j]) for j in range(2)] for i in range(2)])
+    return _canonical(np.array(aa), np.array(bb), ab, count * independent)
+
+
+def _canonical(aa: Array, bb: Array, ab: Array, count: Array) -> Array:
+    """-count log(1 - r^2) from the moments (3, n), (3, n) and (2, 2, n); 0 where there are too few samples."""
+    enough = count > FEW
+    evidence = np.zeros(count.shape)
+    inverses = []
+    for xx, xy, yy in (aa[:, enough], bb[:, enough]):
+        trace = xx + yy
+        det = np.maximum(xx * yy - xy**2, SLIM * trace**2)
+        inverses.append(np.array([[yy, -xy], [-xy, xx]]) / np.maximum(det, 1e-300))
+    ab = ab[:, :, enough]
+    M = np.einsum("ijn,jkn,kln,mln->imn", inverses[0], ab, inverses[1], ab)
+    half, det = (M[0, 0] + M[1, 1]) / 2, M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]
+    squared = half + np.sqrt(np.maximum(half**2 - det, 0.0))
+    evidence[enough] = -(count[enough] - FEW) * np.log1p(-np.clip(squared, 0.0, 1 - 1e-6))
+    return evidence
+
+
+def _refine(
+    a: _Signal, b: _Signal, labels: Sequence[int], scales_s: tuple[float, float, float], start: _Match
+) -> _Match:
+    """The best shift and rate near a trial, on finer and finer grids."""
+    (grid_s, step_s, width_s), shift_s, rate = scales_s, start.shift_s, start.rate
+    at_a = np.arange(a.span[0], a.span[1], grid_s)
+    moved = [a.velocities(label, at_a, step_s) for label in labels]
+    # In the middle of the overlap, shift and rate are independent.
+    ends = [np.clip((t - shift_s) / (1 + rate), *a.span) for t in b.span]
+    middle, span_s = float(np.mean(ends)), max(float(np.ptp(ends)), grid_s)
+    at = shift_s + rate * middle
+    for _ in range(REFINEMENTS):
+        trials = [
+            (at + x * width_s, rate + 2 * y * width_s / span_s)
+            for x in np.linspace(-1, 1, ACROSS)
+            for y in np.linspace(-1, 1, ACROSS)
+        ]
+        found = []
+        for there, r in trials:
+            t_b = at_a + there + r * (at_a - middle)
+            theirs = [b.velocities(label, t_b, step_s) for label in labels]
+            found.append(_direct_evidence(moved, theirs, grid_s / (np.pi * scales_s[2])))
+        (at, rate), width_s = trials[int(np.argmax(found))], width_s / 2
+    return _Match(at - rate * middle, rate)
+
+
+def _direct_evidence(v_a: Sequence[Array], v_b: Sequence[Array], independent: float) -> float:
+    """-count log(1 - r^2) of velocities (n, 2) at the same times."""
+    a, b = np.concatenate(v_a), np.concatenate(v_b)
+    both = (a != 0).any(axis=1) & (b != 0).any(axis=1)
+    a, b = a[both], b[both]
+    aa, bb = ((v.T @ v)[[0, 0, 1], [0, 1, 1]][:, None] for v in (a, b))
+    return float(_canonical(aa, bb, (a.T @ b)[:, :, None], np.array([len(a) * independent]))[0])

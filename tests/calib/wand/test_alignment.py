@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Clocks that differ by up to a minute and run at other rates are found from the motion of one light."""
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from calib.errors import CalibrationError
+from calib.rig.recording import as_they_arrived
+from calib.wand.alignment import align_clocks
+from calib.wand.calibrate import calibrate
+from calib.wand.scale import Distance
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
+from tests.calib.recordings import EPOCH_S, SimulatedRecording, WandScenario, record
+from tests.calib.synthetic import EXACT, camera_errors, ring, roughly
+from tests.calib.synthetic import record as record_ring
+
+LIGHT = Body(diameter_m=0.1)
+SECONDS = 30.0
+MIDDLE_NS = round((EPOCH_S + SECONDS / 2) * 1e9)
+PHONES = {"cam00": (0.0, 0.0), "cam01": (-41.3, 0.009), "cam02": (58.7, -0.0102)}
+
+
+@cache
+def light(cameras: int = 3) -> SimulatedRecording:
+    """A light before cameras that run freely and see it at once most of the time."""
+    return record(
+        WandScenario(
+            cameras=cameras,
+            arc=0.5,
+            seconds=SECONDS,
+            rate_hz=20,
+            sigma_px=0.3,
+            outliers=0.01,
+            offset_ms=0,
+            drift_ppm=0,
+            numbered=True,
+            sized=False,
+            both_sides=True,
+            wand=LIGHT,
+        )
+    )
+
+
+def with_clocks(
+    messages: Sequence[Detections], clocks: Mapping[str, tuple[float, float]]
+) -> list[Detections]:
+    """The messages with stamps that are later by an offset, s, and grow faster by a rate."""
+
+    def stamp(m: Detections) -> int:
+        offset_s, rate = clocks.get(m.camera, (0.0, 0.0))
+        return round(MIDDLE_NS + (m.t_ns - MIDDLE_NS) * (1 + rate) + 1e9 * offset_s)
+
+    return [msgspec.structs.replace(m, t_ns=stamp(m)) for m in messages]
+
+
+@pytest.mark.slow
+def test_offsets_of_a_minute_and_rates_of_one_percent_are_found_and_used():
+    """Poses are as with equal clocks; true times follow from the rig to 0.3 ms over the whole recording, in `run` and
+    `replay` too. One clock is right, and all share one offset that nothing shows."""
+    recorded = light()
+    stamped = with_clocks(recorded.messages, PHONES)
+    gap = recorded.truth.cameras["cam00"].matrix()[:3, 3] - recorded.truth.cameras["cam02"].matrix()[:3, 3]
+    distance = Distance.of(
+        ("cam00", "cam02", float(np.linalg.norm(gap))), 0.001, list(recorded.truth.cameras)
+    )
+    exact = roughly(recorded.intrinsics, EXACT, with_sigma=True)  # a light determines no lenses
+    result = calibrate(exact, LIGHT, stamped, distance)
+    assert camera_errors(result.rig, recorded.truth)[0].max() < 5e-3
+    # Offsets hold in the middle of all stamps, a quarter of a minute from that of the recording.
+    assert re.search(
+        r"'cam01' the stamps are 4[01]\.\d s earlier .* 0\.\d\d % too fast", result.report.timing
+    )
+    true_ns = {(m.camera, m.seq): m.t_ns for m in recorded.messages}
+    arrived = as_they_arrived(stamped, result.rig.cameras)
+    late_ms = {name: [] for name in PHONES}
+    for t_ns, message in arrived:
+        late_ms[message.camera].append(1e-6 * (t_ns - true_ns[message.camera, message.seq]))
+    common = np.mean([np.mean(late) for late in late_ms.values()])
+    scale = np.polyfit(range(len(late_ms["cam00"])), late_ms["cam00"], 1)[0]  # the rate that all clocks share
+    for late in late_ms.values():
+        shared = scale * (np.arange(len(late)) - len(late) / 2)
+        assert np.abs(np.array(late) - shared - common).max() < 0.3
+
+
+@pytest.mark.slow
+def test_a_shift_of_seconds_is_named_as_such():
+    recorded = light()
+    stamped = with_clocks(recorded.messages, {"cam01": (13.6, 0.0)})
+    result = calibrate(recorded.intrinsics, LIGHT, stamped)
+    assert len(result.names) == 3
+    assert "camera 'cam01' the stamps are 13.6 s later than those of the others" in result.report.timing
+    with pytest.raises(CalibrationError, match=r"declared synchronous, but .*13\.6 s later"):
+        calibrate(recorded.intrinsics, LIGHT, stamped, synchronous=True)
+
+
+def test_clocks_that_a_server_keeps_are_not_changed():
+    recorded = light()
+    bounded = [msgspec.structs.replace(m, clock_error_us=500.0) for m in recorded.messages]
+    assert not align_clocks(recorded.intrinsics, LIGHT, with_clocks(bounded, PHONES)).maps
+    assert align_clocks(recorded.intrinsics, LIGHT, with_clocks(recorded.messages, PHONES)).maps
+
+
+@pytest.mark.parametrize("seconds", [8.0, 20.0])
+def test_clocks_that_agree_are_left_alone(seconds: float):
+    arena = ring(4)
+    messages = record_ring(arena, seconds, sigma_px=0.1, sized=False)
+    assert not align_clocks(arena.intrinsics, arena.wand, messages).maps
+
+
+def test_a_drift_of_a_recording_does_not_hold_for_a_running_camera():
+    camera = msgspec.structs.replace(
+        light().truth.cameras["cam00"], time_offset_ms=2.0, time_drift_ppm=1e4, time_reference_ns=10**9
+    )
+    assert camera.capture_ns(3 * 10**9) == 3 * 10**9 + 2_000_000 + 20_000_000
+    assert camera.capture_ns(3 * 10**9, clock_error_us=200.0) == 3 * 10**9 + 2_000_000
