@@ -17,7 +17,7 @@ from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig
 from calib.rig.wand_file import check_diameter
-from calib.wand.alignment import align_clocks
+from calib.wand.alignment import Alignment, align_clocks
 from calib.wand.bundle_adjustment.covariance import estimate_lens_priors, inflate_covariance
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.optimizer import adjust, optimize, optimize_robustly
@@ -173,7 +173,9 @@ def _calibrate_aligned(
         result = _calibrate(rig, wand, aligned, distance)
     except CalibrationError as error:
         raise CalibrationError(f"of {alignment.sentence()}; with these clocks: {error}") from None
-    return with_aligned_clocks(result, alignment, alignment.start_s(given.messages))
+    result = with_aligned_clocks(result, alignment, alignment.start_s(given.messages))
+    timing = f"{result.report.timing}; of {alignment.sentence()}"
+    return replace(result, report=replace(result.report, timing=timing))
 
 
 def _calibrate(rig: Rig, wand: Body, given: _Recorded, distance: Distance | None) -> WandCalibration:
@@ -191,7 +193,12 @@ def _calibrate(rig: Rig, wand: Body, given: _Recorded, distance: Distance | None
     absent = {name: NOT_RECORDED for name in rig.cameras if name not in recording.names}
     placement = replace(placement, unplaced=placement.unplaced | absent, timing=timing)
     jump = find_jump(placement.recording.names, solution.adjusted, solution.observations)
-    return conclude(rig, solution, placement, jump)
+    result = conclude(rig, solution, placement, jump)
+    if solution.adjusted.problem.drift_sigma < SLEWED_DRIFT or all(m.clock_error_us > 0 for m in messages):
+        return result  # no drift, or that of clocks which a server keeps
+    return with_aligned_clocks(
+        result, Alignment(start_ns + round(1e9 * recording.middle_s), {}), -recording.middle_s
+    )
 
 
 def _explain_no_wand(recording: WandRecording) -> str:

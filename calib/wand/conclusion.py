@@ -125,11 +125,9 @@ def with_aligned_clocks(result: WandCalibration, alignment: Alignment, start_s: 
             time_drift_ppm=1e6 * rate[k],
             time_reference_ns=alignment.reference_ns,
         )
-    report = replace(result.report, timing=f"{result.report.timing}; of {alignment.sentence()}")
     return replace(
         result,
         rig=msgspec.structs.replace(result.rig, cameras=cameras),
-        report=report,
         time_offset_ms=offset_ms,
         drift_ppm=1e6 * np.array(rate),
     )

@@ -17,7 +17,7 @@ from calib.wand.scale import Distance
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.recordings import EPOCH_S, SimulatedRecording, WandScenario, record
-from tests.calib.synthetic import EXACT, camera_errors, ring, roughly
+from tests.calib.synthetic import EXACT, STICK, camera_errors, ring, roughly
 from tests.calib.synthetic import record as record_ring
 
 LIGHT = Body(diameter_m=0.1)
@@ -97,6 +97,35 @@ def test_a_shift_of_seconds_is_named_as_such():
     assert "camera 'cam01' the stamps are 13.6 s later than those of the others" in result.report.timing
     with pytest.raises(CalibrationError, match=r"declared synchronous, but .*13\.6 s later"):
         calibrate(recorded.intrinsics, LIGHT, stamped, synchronous=True)
+
+
+def test_drifts_are_stored_and_hold_at_both_ends_of_a_recording():
+    """Clocks of 3000 ppm: after half of twelve seconds they are 9 ms apart, and the rig has the rest to 0.3 ms."""
+    scenario = WandScenario(
+        cameras=3,
+        arc=0.5,
+        seconds=12,
+        rate_hz=20,
+        outliers=0.0,
+        drift_ppm=3000,
+        numbered=True,
+        sized=False,
+        both_sides=True,
+        wand=STICK,
+        seed=2,
+    )
+    recorded = record(scenario)
+    rig = calibrate(recorded.intrinsics, STICK, recorded.messages).rig
+    true_ns = {
+        name: lambda t_ns, k=camera, rate=1e-6 * recorded.drift_ppm[name]: (
+            t_ns + 1e6 * k.time_offset_ms + rate * (t_ns - 1e9 * (EPOCH_S + 6))
+        )
+        for name, camera in recorded.truth.cameras.items()
+    }
+    for t_s in (0.5, 11.5):
+        t_ns = round(1e9 * (EPOCH_S + t_s))
+        late = np.array([rig.cameras[n].capture_ns(t_ns) - true_ns[n](t_ns) for n in true_ns]) * 1e-6
+        assert np.abs(late - late.mean()).max() < 0.3
 
 
 def test_clocks_that_a_server_keeps_are_not_changed():
