@@ -2,6 +2,7 @@
 """The server's corrections of moved cameras, as recorded in the `calibration` map of a rig: both the server and its
 clients read them."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -10,6 +11,21 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 
 CORRECTED = "corrected"  # the entry of the camera that was corrected last
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExtrinsicsCorrection:
+    """A camera was moved.
+
+    Attributes:
+        name: of the camera.
+        camera: with the pose with which it is used again; None when it is excluded.
+        has_returned: whether that pose is the one in use, or one before.
+    """
+
+    name: str
+    camera: Camera | None
+    has_returned: bool = False
 
 
 def correct(rig: Rig, name: str, camera: Camera, t_ns: int) -> Rig:

@@ -67,6 +67,15 @@ class States(Columns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """The robots at one time, `tracked` (R,) tells which of them are known."""
+
+    t_ns: int
+    states: States
+    tracked: Mask
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Transition(Columns):
     """The transition matrices F of the errors of N bodies, by their off-diagonal blocks.
 

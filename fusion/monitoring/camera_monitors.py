@@ -2,14 +2,15 @@
 """Decides which frames of which cameras are used: clocks, frozen images, frames that contradict, moved cameras."""
 
 from calib.rig.camera import Camera
-from camera_node.foundation.arrays import Mask
+from camera_node.foundation.arrays import Array, Mask
+from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
+from fusion.model.states import Snapshot
 from fusion.monitoring.clocks.camera_clocks import CameraClocks
-from fusion.monitoring.clocks.time_search import Snapshot
-from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, ExtrinsicsMonitor, TrackedScene
 from fusion.monitoring.frame_consistency import FrameConsistency
 from fusion.monitoring.frozen_images import FrozenImages
+from fusion.rig_graph.rig_monitor import RigMonitor
 
 
 class CameraMonitors:
@@ -19,14 +20,18 @@ class CameraMonitors:
         cameras: cameras of the rig; `check` and `place` change their poses.
         markers: of all robots.
         single: (R,) robots with a single marker.
+        densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
+        floor_px: the error of a calibration in the image (`Limits`).
     """
 
-    def __init__(self, cameras: CameraArray, markers: MarkerTable, single: Mask) -> None:
+    def __init__(
+        self, cameras: CameraArray, markers: MarkerTable, single: Mask, densities: Array, floor_px: float
+    ) -> None:
         self._cameras = cameras
         self.clocks = CameraClocks(cameras, markers, single)
         self.frozen = FrozenImages(cameras, markers)
         self.consistency = FrameConsistency(cameras, markers)
-        self.extrinsics = ExtrinsicsMonitor()
+        self.rig = RigMonitor(cameras, markers, densities, floor_px)
 
     @property
     def withheld(self) -> set[str]:
@@ -38,7 +43,7 @@ class CameraMonitors:
         self.clocks.inherit(old.clocks)
         self.frozen.inherit(old.frozen)
         self.consistency.inherit(old.consistency)
-        self.extrinsics = old.extrinsics
+        self.rig.inherit(old.rig)
 
     def admit(self, frame: CalibratedFrame, now: Snapshot | None) -> CalibratedFrame | None:
         """A frame in corrected time; None while its camera is withheld, or if that time is in the future.
@@ -52,21 +57,29 @@ class CameraMonitors:
 
     def used(self, frame_set: FrameSet) -> FrameSet:
         """The frame set without the frames of moved cameras."""
-        excluded = self.extrinsics.excluded
+        excluded = self.rig.excluded
         if not excluded:
             return frame_set
         return FrameSet(frame_set.t_ns, tuple(f for f in frame_set.frames if f.camera not in excluded))
 
-    def observe(self, now: Snapshot, detections: DetectionTable, assignments: Assignments) -> None:
+    def is_doubtful(self, t_ns: int) -> bool:
+        """Whether a camera contradicted the others just now, or may be at fault."""
+        return bool(self.consistency.in_doubt(t_ns)) or self.rig.is_doubtful
+
+    def observe(
+        self, now: Snapshot, detections: DetectionTable, assignments: Assignments, is_doubtful: bool
+    ) -> None:
         """Compare the clocks in a frame set; see `CameraClocks.observe`."""
-        is_doubtful = bool(self.consistency.in_doubt(now.t_ns) or self.extrinsics.excluded)
         self.clocks.observe(now, detections, assignments, is_doubtful)
 
     def check_extrinsics(
-        self, frame_set: FrameSet, scene: TrackedScene, recalibrates: bool
+        self, frame_set: FrameSet, now: Snapshot, recalibrates: bool, is_doubtful: bool
     ) -> tuple[ExtrinsicsCorrection, ...]:
-        """Exclude moved cameras and apply recalibrated poses; see `ExtrinsicsMonitor.check`."""
-        corrections = self.extrinsics.check(frame_set, scene, recalibrates, self.clocks.suspects)
+        """Exclude moved cameras, apply recalibrated poses and correct clocks; see `RigMonitor.check`."""
+        corrections = self.rig.check(frame_set, now, recalibrates, is_doubtful)
+        if (clock := self.rig.take_clock()) is not None:
+            self.clocks.correct(*clock)
+            self.consistency.forget(clock[0])
         for correction in corrections:
             if correction.camera is not None:
                 self._cameras.place(correction.name, correction.camera)
@@ -79,4 +92,4 @@ class CameraMonitors:
         if camera.clock != self._cameras[name].clock:
             self.clocks.reset(name)
         self._cameras.place(name, camera)
-        (self.extrinsics.pin if pinned else self.extrinsics.readmit)(name)
+        (self.rig.pin if pinned else self.rig.readmit)(name)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from fusion.model.expected_views import ExpectedViews
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.model.states import States
-from fusion.monitoring.expected_views import ExpectedViews
 
 LEARNED = 15  # frames that define the usual number of assigned detections of a camera
 MIN_USUAL = 8.0  # assigned detections, from which a frame is judged
@@ -22,9 +22,7 @@ MIN_DETECTED = 0.6  # of the usual number: a camera that sees little contradicts
 CONTRADICTS = 0.5  # of the expected markers: with fewer of them assigned, a frame contradicts the robots
 MIN_EXPECTED = 6  # markers, from which a frame is judged
 MIN_OTHERS = 2  # other cameras that agree
-HELD_NS = (
-    700_000_000  # after a contradiction, in which its camera is in doubt: memory of `extrinsics_monitor`
-)
+HELD_NS = 700_000_000  # after a contradiction, in which its camera is in doubt: the shortest window of the rig graph
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,10 +14,10 @@ import numpy as np
 from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.logs import about
+from fusion.model.expected_views import ExpectedViews
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import CameraArray, MarkerTable
-from fusion.monitoring.clocks.time_search import Snapshot
-from fusion.monitoring.expected_views import ExpectedViews
+from fusion.model.states import Snapshot
 
 log = logging.getLogger("fusion")
 SEEN_PX = 2.0  # between an expected and a detected roundel

@@ -1,63 +1,94 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Detects frame sets with unusual residuals, and the camera that causes them.
+"""Detects frame sets that contradict the predictions of the robots, and the camera that causes it.
 
-A slightly moved camera keeps its detections within their gates but biases the robots. Where the residuals of a frame
-set rise, the tracker leaves out each camera in turn. The camera at fault is the one without which observations and
-predictions of all robots agree: of residuals alone, those of the last two or three cameras always fall, because
-position and velocity of a robot adapt to them.
+A camera that turns by a third of a degree keeps its detections within their gates, and a fit may follow it: frames of
+different times explain an offset of an image by a velocity. But then the fit is far from its prediction. So the cost of
+a fit counts both, and is chi-square if all claims hold (Bar-Shalom et al. 2001, section 5.4).
 """
 
-import numpy as np
+from collections.abc import Mapping
 
-from camera_node.foundation.arrays import Array
-from fusion._core import SLACK_PX
+import numpy as np
+from scipy.stats import chi2
+
+from camera_node.foundation.arrays import Array, Index
+from fusion._core import CAUCHY, SLACK_PX
 
 MIN_RESIDUALS = 12  # in a frame set
-MIN_PX, MIN_RATIO = 0.2, 2.0  # of an unusual median residual: absolute, and relative to the usual one
+MIN_RATIO = 2.0  # of an unusual residual to the usual one
 SLACK_RATIO = 3.0  # of the largest calibration errors to the usual residual
-LEARNED = 15  # frame sets that define the usual residual
-CAUCHY, REJECTED = (
-    4.0,
-    100.0,
-)  # scale of the cost, standard deviations; square that a rejected observation has
+LEARNED = 15  # frame sets that define what is usual
+REJOINED = 0.01  # probability with which detections that agree are left out once more
+POSE_ERRORS = 6
+FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 frame sets a second
 
 
 class ResidualMonitor:
-    """The usual residual of a frame set."""
+    """The usual residual of a frame set, and the usual cost of its fit."""
 
     def __init__(self) -> None:
-        self._usual_px, self._learned = 0.0, 0
+        self._usual_px, self._usual_cost, self._learned = 0.0, 1.0, 0
 
     @property
     def slack_px(self) -> float:
         """Standard deviation that covers calibration errors: as the residuals show, `SLACK_PX` until they are known."""
         return min(SLACK_PX, SLACK_RATIO * self._usual_px) if self._learned >= LEARNED else SLACK_PX
 
-    def is_unusual(self, squared_px: Array) -> bool:
-        """Whether the squared residuals (N,) of a frame set, px^2, are far above the usual ones; learns others."""
-        if len(squared_px) < MIN_RESIDUALS:
+    def is_unusual(self, cost: Array, count: Index) -> bool:
+        """Whether most robots contradict their predictions by more than chance and more than usual.
+
+        Args:
+            cost: (R,) of the fit of each robot, as by `costs_of`.
+            count: (R,) of its detections.
+        """
+        if self._learned < LEARNED or count.sum() < MIN_RESIDUALS:
             return False
-        median_px = _median_px(squared_px)
-        if self._learned >= LEARNED and median_px > max(MIN_PX, MIN_RATIO * self._usual_px):
-            return True
-        self._learn(median_px)
-        return False
+        n = 2 * int(count.sum())
+        limit = max(float(chi2.isf(FALSE_ALARM, n)) / n, MIN_RATIO**2 * self._usual_cost)
+        return bool(_mean_cost(cost, count) > limit)
 
-    def learn(self, squared_px: Array) -> None:
-        """Count the squared residuals (N,) of a frame set, px^2, as usual."""
-        if len(squared_px) >= MIN_RESIDUALS:
-            self._learn(_median_px(squared_px))
+    def is_explained(self, cost: float, count: int) -> bool:
+        """Whether detections of a camera agree with a fit without them.
 
-    def _learn(self, median_px: float) -> None:
+        Args:
+            cost: what they add to the cost of the fit.
+            count: of these detections; they show nothing if they have no more equations than a pose has errors.
+        """
+        allowed = chi2.isf(REJOINED, 2 * count) * max(1.0, self._usual_cost)
+        return 2 * count > POSE_ERRORS and bool(cost < allowed)
+
+    def learn(self, squared_px: Array, cost: Array, count: Index) -> None:
+        """Count a frame set as usual: the squared residuals (N,) of its detections, px^2, and its costs."""
+        if len(squared_px) < MIN_RESIDUALS:
+            return
         self._learned += 1
-        self._usual_px += (median_px - self._usual_px) / min(self._learned, LEARNED)
+        share = 1 / min(self._learned, LEARNED)
+        self._usual_px += share * (_median_px(squared_px) - self._usual_px)
+        self._usual_cost += share * (_mean_cost(cost, count) - self._usual_cost)
 
 
-def camera_at_fault(cost: float, without: dict[int, float]) -> int | None:
+def costs_of(squared: Array, body: Index, corrections: Array, information: Array) -> Array:
+    """(R,) robust costs of the fits of R robots: observations and predictions.
+
+    Args:
+        squared: (N,) squared residuals in standard deviations; infinite where not visible.
+        body: (N,) the robots.
+        corrections: (R, 12) of the predicted states.
+        information: (R, 12, 12) of the predictions.
+    """
+    observed = CAUCHY**2 * np.log1p(np.minimum(squared, REJECTED) / CAUCHY**2)
+    predicted = np.einsum("ri,rij,rj->r", corrections, information, corrections)
+    return np.bincount(body, observed, len(corrections)) + predicted
+
+
+REJECTED = 100.0  # squared residual, in standard deviations, that a detection far away has
+
+
+def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:
     """The camera without which the cost of a frame set falls, far below that without any other; None without one.
 
     Args:
-        cost: with all cameras, as by `cost_of`.
+        cost: with all cameras.
         without: the cost without each camera, by its index.
     """
     if len(without) < 2:
@@ -66,18 +97,10 @@ def camera_at_fault(cost: float, without: dict[int, float]) -> int | None:
     return best if without[best] < min(cost, without[second]) / MIN_RATIO else None
 
 
-def cost_of(squared: Array, n_rejected: int, corrections: Array, information: Array) -> float:
-    """The robust cost of an update: observations and predictions.
-
-    Args:
-        squared: (N,) squared residuals in standard deviations; infinite where not visible.
-        n_rejected: observations of robots that these contradict.
-        corrections: (R, 12) of the predicted states.
-        information: (R, 12, 12) of the predictions.
-    """
-    bounded = np.append(np.minimum(squared, REJECTED), np.full(n_rejected, REJECTED))
-    observed = CAUCHY**2 * np.log1p(bounded / CAUCHY**2).sum()
-    return float(observed + np.einsum("ri,rij,rj->", corrections, information, corrections))
+def _mean_cost(cost: Array, count: Index) -> float:
+    """The cost of an equation of the median robot: 1 if the claims hold."""
+    seen = count > 0
+    return float(np.median(cost[seen] / (2 * count[seen])))
 
 
 def _median_px(squared_px: Array) -> float:

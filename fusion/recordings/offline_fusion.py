@@ -22,10 +22,10 @@ from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.recorded_detections import detect_frames, read_observations
 from fusion.errors import FusionError
+from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot, load_robots
-from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.pose_messages import FusedFrames
 from fusion.recordings.arena_recording import DETECTIONS, ArenaRecording
 from fusion.server.frame_synchronizer import FrameSynchronizer
@@ -166,7 +166,7 @@ def _fuse(
             yield fused
         else:
             yield from smoother.add(fused)
-        for correction in tracker.check_extrinsics(frame_set, fused):
+        for correction in tracker.check_extrinsics(frame_set):
             summary.add_correction(correction, frame_set.t_ns)
     summary.not_acquired = tracker.not_acquired()
     if not summary.frame_sets:

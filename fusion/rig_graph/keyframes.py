@@ -8,7 +8,7 @@ pose is where the search of a hypothesis begins.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -17,6 +17,7 @@ import numpy as np
 from calib.rig.camera import FOCAL_STABILITY, Camera, pixel_jacobians
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_rotation
+from fusion.model.expected_views import ExpectedViews
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import (
     CameraArray,
@@ -25,12 +26,11 @@ from fusion.model.observations import (
     MarkerTable,
     MatchedObservations,
 )
-from fusion.model.states import States
-from fusion.monitoring.clocks.time_search import Snapshot
-from fusion.monitoring.expected_views import ExpectedViews
-from fusion.monitoring.recalibration import image_shift
+from fusion.model.states import Snapshot, States
 from fusion.rig_graph.hypotheses import ERRORS, Window
 
+SEARCH_PX = 120.0  # largest image shift: 8 degrees at a focal length of 840 px
+BIN_PX = 6.0
 INTERVAL_NS = 90_000_000  # between keyframes: a tenth of a second, at 30 frame sets a second too
 HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its robots
 MAX_ROBOTS = 4  # of a keyframe; the next one has others
@@ -191,7 +191,7 @@ def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tupl
 def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tuple[Index, Index]]]:
     """The same for views that show their markers elsewhere."""
     T, matches = camera.matrix(), [(np.empty(0, np.intp), np.empty(0, np.intp)) for _ in views]
-    shift = image_shift((view.uv for view in views), (view.frame.roundels.uv for view in views))
+    shift = _image_shift((view.uv for view in views), (view.frame.roundels.uv for view in views))
     points = np.concatenate([view.points for view in views], axis=1).T
     of_view = np.cumsum([len(view.rows) for view in views])[:-1]
     for gate in GATES_PX:
@@ -205,6 +205,24 @@ def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, lis
         T = _fit_pose(camera, T, shown, np.concatenate([v.frame.roundels.uv[d] for v, (_, d) in pairs]))
         shift = np.zeros(2)
     return T, matches
+
+
+def _image_shift(expected: Iterable[Array], detected: Iterable[Array]) -> Array:
+    """(2,) the image shift on which most pairs of expected and detected roundels agree, pixels.
+
+    Args:
+        expected, detected: (N, 2) and (M, 2) of each frame of a camera, pixels.
+    """
+    size = int(SEARCH_PX / BIN_PX)
+    votes = np.zeros((2 * size + 1, 2 * size + 1))
+    pairs = zip(expected, detected, strict=True)
+    off = np.concatenate([(there[None] - uv[:, None]).reshape(-1, 2) for uv, there in pairs])
+    off = off[(np.abs(off) < SEARCH_PX).all(1)]
+    np.add.at(votes, tuple(np.round(off / BIN_PX).astype(int).T + size), 1)
+    smooth = sum(np.roll(votes, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))
+    best = (np.array(np.unravel_index(np.argmax(smooth), votes.shape)) - size) * BIN_PX
+    near = off[np.linalg.norm(off - best, axis=1) < 2 * BIN_PX]
+    return np.median(near, axis=0) if len(near) else np.zeros(2)
 
 
 def _nearest(expected: Array, seen: Array, gate_px: float) -> tuple[Index, Index]:

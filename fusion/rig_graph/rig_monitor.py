@@ -6,16 +6,20 @@
     a pose, decided       -> the camera is excluded until its pose is known, then used with it
     undecided             -> the cameras that contradict each other are reported, and all are used as they are
 
-The server does not use it yet: `monitoring/extrinsics_monitor.py` decides there; docs/design/rig_graph.md says what is
-missing. No pose changes unless one hypothesis beats every other one: robots that follow a camera at fault make
-innocent cameras look wrong.
+No pose changes unless one hypothesis beats every other one: robots that follow a camera at fault make innocent cameras
+look wrong.
 """
 
 import logging
+import os
+import signal
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from multiprocessing import get_context, parent_process
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -24,11 +28,13 @@ from scipy.stats import chi2
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose
+from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
-from fusion.monitoring.clocks.time_search import Snapshot
-from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
+from fusion.model.states import Snapshot
+from fusion.protocol.pose_messages import Contradiction
 from fusion.rig_graph.hypotheses import (
+    ERRORS,
     FALSE_ALARM,
     Fit,
     Hypothesis,
@@ -41,12 +47,15 @@ from fusion.rig_graph.hypotheses import (
 from fusion.rig_graph.keyframes import Keyframe, Keyframes, window_of
 
 log = logging.getLogger("fusion")
+T = TypeVar("T")
+NICENESS = 10  # of the process that judges: poses and detections come first
 # Keyframes that are judged: the more, the better they determine a camera; the fewer, the sooner all of them are new.
 WINDOWS = 24, 12, 6
 CHECK_NS, SUSPICIOUS_NS = (
     500_000_000,
     200_000_000,
 )  # between two checks: usually, and while cameras contradict
+USUAL_SHARE = 0.1  # of a core, while cameras do not contradict each other
 CHANGED = 2.0  # ratio of the mean robust costs in both halves of a window in which something changed
 USUAL = (
     0.2  # mean robust cost that shows nothing: twice that of Gaussian noise, E[log(1 + chi2_2 / CAUCHY^2)]
@@ -80,8 +89,12 @@ class RigMonitor:
         self._keyframes = Keyframes(cameras, markers, max(WINDOWS))
         self._job: Future[tuple[Window, Verdict] | None] | None = None
         self._checked_ns = self._revision = self._n_undecided = 0
-        self._is_contradicted, self._clock = False, None
-        self.widening = 1.0
+        self._pause_ns = 0  # after the last job
+        self._is_contradicted = False
+        self._clock: tuple[str, float, float] | None = None
+        self._clocks: list[tuple[str, float, float]] = []  # the last verdicts in a row
+        self._was_doubtful = False
+        self.widening, self._claim_m = 1.0, 0.0  # a detection's claimed error at its robot, metres
         self.executor: Executor | None = None
         self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
         self.excluded: set[str] = set()
@@ -118,12 +131,31 @@ class RigMonitor:
         """Whether a camera is at fault, by more or other than its clock, or may be."""
         return bool(self.excluded) or self._is_contradicted
 
-    def confirms_clock(self, name: str) -> bool:
-        """Whether the last keyframes are explained by the clock of this camera and by nothing else."""
-        return self._clock == name
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """The cameras of which some are at fault, if several judgements did not decide which."""
+        if not self.contradicting:
+            return ()
+        return (
+            Contradiction(
+                kind="undecided",
+                names=self.contradicting,
+                error_over_claim=self.widening,
+                size_mm=1e3 * self._claim_m * self.widening**0.5,
+            ),
+        )
+
+    def take_clock(self) -> tuple[str, float, float] | None:
+        """A camera whose clock alone explains the last keyframes: true capture time minus stamp, and sigma, seconds.
+
+        Its stamps are corrected from now on, so that the keyframes are forgotten.
+        """
+        found, self._clock = self._clock, None
+        if found is not None:
+            self._use(found[0])
+        return found
 
     def check(
-        self, frame_set: FrameSet, now: Snapshot, recalibrates: bool
+        self, frame_set: FrameSet, now: Snapshot, recalibrates: bool, is_doubtful: bool = False
     ) -> tuple[ExtrinsicsCorrection, ...]:
         """Judge the cameras if it is time; the cameras to exclude, and those to use with another pose.
 
@@ -131,9 +163,14 @@ class RigMonitor:
             frame_set: with the frames of excluded cameras.
             now: the robots after the update with this frame set.
             recalibrates: False for a shard that waits for the poses from another.
+            is_doubtful: whether the frame set contradicts the predictions. When that begins, something changed: the
+                keyframes before do not show what is now.
         """
+        if is_doubtful and not self._was_doubtful:
+            self._forget()
+        self._was_doubtful = is_doubtful
         is_new, kept = self._keyframes.add(frame_set, now), self._keyframes.kept
-        wait_ns = SUSPICIOUS_NS if self.is_doubtful else CHECK_NS
+        wait_ns = SUSPICIOUS_NS if self.is_doubtful else max(CHECK_NS, self._pause_ns)
         if (
             self._job is None
             and is_new
@@ -142,7 +179,7 @@ class RigMonitor:
         ):
             self._checked_ns = now.t_ns
             self._revision = self._cameras.revision
-            given = CameraArray(self._cameras.as_dict())  # which does not change while it is judged
+            given = self._cameras.as_dict()  # of this moment
             job = partial(judge_latest, tuple(kept), given, self._markers, self._densities, self._floor_px)
             self._job = _done(job) if self.executor is None else self.executor.submit(job)
         if self._job is None or not self._job.done():
@@ -150,18 +187,27 @@ class RigMonitor:
         job, self._job = self._job, None
         if self._revision != self._cameras.revision:
             return ()
-        if (judged := job.result()) is None:
+        self._pause_ns = round((now.t_ns - self._checked_ns) / USUAL_SHARE)
+        try:
+            judged = job.result()
+        except Exception:  # of a process that ended, or of a singular system: the next keyframes are others
+            log.exception("the cameras can't be judged")
+            return ()
+        if judged is None:
             self._is_contradicted = True
             return ()
         return self._act(*judged, recalibrates)
 
     def _act(self, window: Window, verdict: Verdict, recalibrates: bool) -> tuple[ExtrinsicsCorrection, ...]:
         names = tuple(window.names[k] for k in verdict.cameras)
-        self._clock = names[0] if verdict.cause == "clock" else None
-        self._is_contradicted = bool(names) and verdict.cause != "clock"
+        self._note_clock(names[0], verdict) if verdict.cause == "clock" else self._clocks.clear()
+        self._is_contradicted = bool(names)
         self.widening = verdict.misfit if names else 1.0
+        self._claim_m = _claim_m(window)
         self._n_undecided = self._n_undecided + 1 if names and verdict.cause is None else 0
         self._note_undecided(names if self._n_undecided >= CONFIRMED else ())
+        if not names:
+            return self._returned(window)
         if verdict.cause != "pose" or names[0] in self.pinned:
             return ()
         name, k = names[0], verdict.cameras[0]
@@ -172,6 +218,23 @@ class RigMonitor:
             return changes
         self._use(name)
         return (*changes, placed)
+
+    def _returned(self, window: Window) -> tuple[ExtrinsicsCorrection, ...]:
+        """The excluded cameras that agree with the others, as they were: nothing is at fault in the window."""
+        count = np.bincount(window.camera, minlength=len(window.names))
+        names = [n for n, k in zip(window.names, count, strict=True) if n in self.excluded and k >= ERRORS]
+        for name in names:
+            self._use(name)
+        return tuple(ExtrinsicsCorrection(name, self._cameras[name], has_returned=True) for name in names)
+
+    def _note_clock(self, name: str, verdict: Verdict) -> None:
+        """Correct a clock once several verdicts in a row agree on it: a robot's own motion may look like one."""
+        k, best = verdict.cameras[0], verdict.fit
+        self._clocks.append((name, float(best.errors[k, 6]), float(np.sqrt(best.covariance(k)[6, 6]))))
+        if len({clock[0] for clock in self._clocks}) > 1:
+            self._clocks = self._clocks[-1:]
+        if len(self._clocks) >= CONFIRMED:
+            self._clock = self._clocks[-1]
 
     def _note_undecided(self, names: tuple[str, ...]) -> None:
         """Log cameras that contradict each other when that begins, and when it ends."""
@@ -216,31 +279,41 @@ class RigMonitor:
             known.append(camera.T_world_cam)
             del known[1 : 1 - MAX_KNOWN]  # never the calibration's: the others are less accurate
 
+    def _forget(self) -> None:
+        """Drop the keyframes and what is judged by them."""
+        self._keyframes.clear()
+        self._job = None
+
     def _use(self, name: str) -> None:
         self.excluded.discard(name)
-        self._keyframes.clear()
+        self._forget()
         self._is_contradicted, self._n_undecided, self.widening = False, 0, 1.0
+        self._clocks.clear()
         self._note_undecided(())
 
 
 def _done(job: Callable[[], tuple[Window, Verdict] | None]) -> "Future[tuple[Window, Verdict] | None]":
     """The result of a job that runs at once."""
     future: Future[tuple[Window, Verdict] | None] = Future()
-    future.set_result(job())
+    try:
+        future.set_result(job())
+    except Exception as error:  # as of a job elsewhere
+        future.set_exception(error)
     return future
 
 
 def judge_latest(
     keyframes: Sequence[Keyframe],
-    cameras: CameraArray,
+    cameras: Mapping[str, Camera],
     markers: MarkerTable,
     densities: Array,
     floor_px: float,
 ) -> tuple[Window, Verdict] | None:
     """Judge the longest window in which nothing changed; None without one."""
+    array = CameraArray(dict(cameras))
     for n in WINDOWS:
         if n <= len(keyframes):
-            window, starts = window_of(keyframes[-n:], cameras, markers, densities, floor_px)
+            window, starts = window_of(keyframes[-n:], array, markers, densities, floor_px)
             verdict = judge(window, starts)
             if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict
@@ -254,9 +327,55 @@ def _is_stationary(cost: Array) -> bool:
     return bool(max(before, after) < CHANGED * min(before, after) or max(before, after) < USUAL)
 
 
+def _claim_m(window: Window) -> float:
+    """RMS of the claimed errors of detections at the distance of their robots, metres."""
+    seen, body = window.observations.detections, window.observations.discs.body
+    range_m = np.linalg.norm(window.states.p[body] - window.T[window.camera, :3, 3], axis=1)
+    pixel = np.sqrt(np.abs(seen.scale[0, 0] * seen.scale[1, 1] - seen.scale[0, 1] * seen.scale[1, 0]))
+    return float(np.sqrt(np.mean((seen.cov[0, 0] + seen.cov[1, 1]) / 2 * (range_m / pixel) ** 2)))
+
+
 def _sigma_px(window: Window, best: Fit, covariance: Array, k: int) -> float:
     """RMS standard deviation, pixels, of the images of a camera's markers by the covariance (6, 6) of its pose."""
     mine = np.flatnonzero(window.camera == k)
     B, cov = best.by_camera[mine, :, :6], window.observations.detections.cov[:, :, mine]
     variance = np.einsum("nai,ij,naj->n", B, covariance, B) / 2 * (cov[0, 0] + cov[1, 1]) / 2
     return float(np.sqrt(variance.mean()))
+
+
+class JudgeProcess(Executor):
+    """One process that judges: a thread would delay the poses, since it shares their GIL. It begins with
+    the first job, again after it crashed, and ends with this process, even by SIGKILL."""
+
+    def __init__(self) -> None:
+        self._pool = _pool()
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Run a function of a module with arguments that can be pickled."""
+        try:
+            return self._pool.submit(fn, *args, **kwargs)
+        except BrokenExecutor:
+            self._pool = _pool()
+            return self._pool.submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the process."""
+        self._pool.shutdown(wait=wait, cancel_futures=cancel_futures)
+
+
+def _pool() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin)
+
+
+def _begin() -> None:
+    """Leave interrupts to the parent, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(NICENESS)
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

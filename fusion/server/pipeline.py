@@ -3,6 +3,7 @@
 
 import logging
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +13,9 @@ from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
-from fusion.model.corrections import corrected_camera
+from fusion.model.corrections import ExtrinsicsCorrection, corrected_camera
 from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import Robot
-from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.pose_messages import RobotsRequest, ShardPoses
 from fusion.protocol.shards import Shard
 from fusion.server.arena_config import ArenaConfig
@@ -55,10 +55,11 @@ class TrackingPipeline:
         self.synchronizer: FrameSynchronizer
         self.early: AssociatedFrames | None = None  # of the open frame set
         self._is_wand_recorded = False
+        self._judging: Executor | None = None
         self._start(self.cameras)
         self.active_rig.load(lambda rig: self._start(rig.placed()))
         if self.tracker is not None:
-            self.tracker.monitors.extrinsics.remember(rig.placed() for rig in self.active_rig.earlier())
+            self.tracker.monitors.rig.remember(rig.placed() for rig in self.active_rig.earlier())
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -76,7 +77,7 @@ class TrackingPipeline:
         self._start(self.cameras)
         if old is not None and self.tracker is not None:
             self.tracker.monitors.clocks.inherit(old.monitors.clocks)
-            self.tracker.monitors.extrinsics.inherit_poses(old.monitors.extrinsics)
+            self.tracker.monitors.rig.inherit_poses(old.monitors.rig)
 
     def replace_rig(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
         """Use a rig that was requested, then save it. Robots stay tracked if at most one camera differs.
@@ -171,6 +172,7 @@ class TrackingPipeline:
         """Restart tracking."""
         limits = self._config.limits
         self.tracker = Tracker(cameras, self.robots, limits, self._shard) if cameras else None
+        self.judge_cameras_in(self._judging)
         self.pause_acquisition(self._is_wand_recorded)
         self.synchronizer = FrameSynchronizer.at_rate(self._config.rate_hz, limits.lateness_ms)
         if cameras:
@@ -203,6 +205,12 @@ class TrackingPipeline:
         self._is_wand_recorded = is_wand_recorded
         if self.tracker is not None:
             self.tracker.acquires_none = is_wand_recorded
+
+    def judge_cameras_in(self, executor: Executor | None) -> None:
+        """Judge the cameras beside the thread that tracks; in it with None, so that a run repeats exactly."""
+        self._judging = executor
+        if self.tracker is not None:
+            self.tracker.monitors.rig.executor = executor
 
     def add_shard_poses(self, poses: ShardPoses) -> None:
         """Use the robots of another shard: their detections are not available to the robots of this one."""
@@ -237,11 +245,11 @@ class TrackingPipeline:
         return replace(
             general,
             calibrated=frozenset(self.cameras),
-            excluded=frozenset(tracker.monitors.extrinsics.excluded),
+            excluded=frozenset(tracker.monitors.rig.excluded),
             frozen=frozenset(tracker.monitors.frozen.names),
             clocks=tracker.monitors.clocks.health(),
             geometry_residuals_px=tracker.geometry.misfits(),
             measured_diameters_m=tracker.sizes.misfits(),
             not_acquired=tracker.not_acquired(),
-            contradictions=tracker.claims.contradictions(),
+            contradictions=tracker.monitors.rig.contradictions() or tracker.claims.contradictions(),
         )

@@ -21,9 +21,9 @@ from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.session import listening_endpoints
 from camera_node.protocol.tcp_sockets import close_excess, stop_lingering
 from fusion.errors import FusionError
+from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import FrameSet
 from fusion.model.undistortion import prepare_lenses
-from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection
 from fusion.protocol.arena_health import describe_status
 from fusion.protocol.pose_messages import (
     FusedFrames,
@@ -37,6 +37,7 @@ from fusion.protocol.pose_messages import (
     shard_key,
 )
 from fusion.protocol.shards import Shard
+from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.arena_queries import ArenaQueries, CameraQueries
 from fusion.server.fair_use import FrameQuotas
@@ -117,7 +118,12 @@ class Server:
 
     def run(self) -> None:
         """Serve: receive, synchronize, track and publish, report the status."""
-        with ServiceManager() as service, collecting_between_frame_sets() as collect_garbage:
+        with (
+            ServiceManager() as service,
+            collecting_between_frame_sets() as collect_garbage,
+            JudgeProcess() as judge,
+        ):
+            self.pipeline.judge_cameras_in(judge)
             service.ready()
             while not self._stopped.is_set():
                 is_backlogged = self.transport.receive(TICK_S, self._max_lag_ns)
@@ -226,7 +232,7 @@ class Server:
         if self.shard.leads:
             self.transport.publish(self.keys.markers, result.markers)
             self.transport.publish(frames_key(self.keys.arena), FusedFrames.of(frame_set))
-        for correction in tracker.check_extrinsics(frame_set, result):
+        for correction in tracker.check_extrinsics(frame_set):
             self._report_correction(correction)
         for name in result.crowded:
             self.statistics.count_fault(TOO_MANY_UNASSIGNED, name)

@@ -142,11 +142,20 @@ class Estimator:
         Raises:
             RuntimeError: the system of a body is singular (from GTSAM or the native core).
         """
+        return self.fit(prediction, self.prepared(prediction.states, observations), small)
+
+    def prepared(self, states: States, observations: MatchedObservations) -> MatchedObservations:
+        """Observations as `fit` takes them: with straight outlines, and the noise of late frames and of clocks."""
+        return self.with_time_errors(states, self._straighten(states, observations))
+
+    def fit(
+        self, prediction: Prediction, observations: MatchedObservations, small: float = SMALL
+    ) -> tuple[States, Array]:
+        """`update` by `prepared` observations."""
         states, n = prediction.states, len(prediction.states)
         bodies = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
         if not len(bodies):
             return states, np.empty((2, 0))
-        observations = self.with_time_errors(states, self._straighten(states, observations))
         problem = _Problem(observations, _shaped(observations), bodies, prediction.information[bodies])
         solution = self._solve(problem, states, np.zeros((n, 12)))
         for _ in range(MAX_ITERATIONS - 1):

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Updates the states of robots with detections of which some may be wrong.
 
-A robot that its detections contradict keeps its prediction. If the residuals of all robots are unusual, the camera that
-causes them is left out of the frame set (`residual_monitor`). Then detections are left out that contradict the others
-of their robot (joint compatibility).
+A robot that its detections contradict keeps its prediction. If the fits of most robots contradict their predictions,
+the camera that causes this is left out of the frame set (`residual_monitor`). If none is found, the noise of all
+detections grows until the fits agree with the predictions: robots hold to these, and claim less. Then detections are
+left out that contradict the others of their robot (joint compatibility).
 
 Association gates each detection alone: the prediction may be off by a centimetre, and the gates are as wide. But that
 error is common to all markers of a robot. Once some detections determine it, the others must lie within noise and
@@ -12,7 +13,7 @@ until all agree (Baarda's data snooping, 1968). A robust kernel alone may conver
 since noise of 0.1 px makes all detections outliers of a prediction that is 1 px off.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from fusion.model.observations import (
     mean_by_body,
 )
 from fusion.model.states import POSITION, States
-from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, cost_of
+from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, costs_of
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
 
@@ -35,6 +36,7 @@ SUSPICIOUS = 4.0
 # Correction of a position in standard deviations of its prediction: those of frames 33 ms apart have 11 mm. No false
 # roundel has displaced a robot by more than its correction and the error of its prediction.
 MIN_CORRECTION = 0.5
+MAX_ADDED_PX2 = 32.0**2  # noise that makes anything usual within the gates of association
 CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
 
 
@@ -44,21 +46,16 @@ class RobustFit:
 
     Attributes:
         prediction: the robots before the update.
-        squared: (N,) squared residuals of the assignments in standard deviations.
-        n_rejected: observations of the robots that these contradict.
+        detections: of the frame set, with the noise that the fit gives them.
+        cost, count: (R,) of each robot: its fit, as by `costs_of`, and its detections.
     """
 
     states: States
     assignments: Assignments
     prediction: Prediction
-    squared: Array
-    n_rejected: int
-
-    @property
-    def cost(self) -> float:
-        """See `cost_of`."""
-        corrections = self.states.minus(self.prediction.states)
-        return cost_of(self.squared, self.n_rejected, corrections, self.prediction.information)
+    detections: DetectionTable
+    cost: Array
+    count: Index
 
 
 class RobustUpdate:
@@ -67,60 +64,108 @@ class RobustUpdate:
     Args:
         estimator: of the robots.
         markers: of the robots.
+
+    Attributes:
+        added_px2: variance that detections have beside their own noise while nothing explains what they contradict.
     """
 
     def __init__(self, estimator: Estimator, markers: MarkerTable) -> None:
         self._estimator, self._markers = estimator, markers
         self._residuals = ResidualMonitor()
+        self._left_out: int | None = None  # the camera at fault in the last frame set
+        self.added_px2 = 0.0
 
     def inherit(self, old: "RobustUpdate") -> None:
         """Continue with the usual residuals of other robots."""
         self._residuals = old._residuals
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the last frame set contradicted the predictions."""
+        return self._left_out is not None or self.added_px2 > 0
+
     def update(
         self, prediction: Prediction, detections: DetectionTable, assignments: Assignments
     ) -> RobustFit:
         """The updated states, and the assignments that fit."""
-        fitted = self._fit(prediction, detections, assignments)
-        if self._residuals.is_unusual(fitted.assignments.squared_px):
-            fitted = self._leave_one_out(prediction, detections, assignments, fitted)
-        return self._without_incompatible(fitted, detections)
+        fitted, last_px2 = self._fit(prediction, detections, assignments), self.added_px2
+        self.added_px2 = 0.0
+        if (again := self._left_out_again(fitted, assignments)) is not None:
+            fitted = again
+        elif not self._is_unusual(fitted):
+            self._left_out = None
+            self._residuals.learn(fitted.assignments.squared_px, fitted.cost, fitted.count)
+        else:
+            fitted = self._leave_one_out(fitted, assignments) or self._with_noise(
+                fitted, assignments, last_px2
+            )
+        return self._without_incompatible(fitted)
+
+    def _is_unusual(self, fitted: RobustFit) -> bool:
+        return self._residuals.is_unusual(fitted.cost, fitted.count)
 
     def _fit(self, prediction: Prediction, detections: DetectionTable, assignments: Assignments) -> RobustFit:
         """The updated states; a robot that its detections contradict stays as predicted and loses them."""
         observations = MatchedObservations.of(assignments, detections, self._markers)
-        states, residuals = self._estimator.update(prediction, observations)
+        observations = self._estimator.prepared(prediction.states, observations)
+        states, residuals = self._estimator.fit(prediction, observations)
         assignments = assignments.with_residuals(residuals)
-        body, n = observations.discs.body, len(prediction.states)
-        squared = observations.misfit(residuals)
-        contradicted = mean_by_body(squared > MAX_CHI2, body, n) > CONTRADICTED
-        rows, fits = np.flatnonzero(contradicted), ~contradicted[body]
+        body, n, cov = observations.discs.body, len(prediction.states), observations.detections.cov
+        squared = np.nan_to_num(np.sum(residuals**2, 0) * 2 / (cov[0, 0] + cov[1, 1]), nan=np.inf)
+        cost = costs_of(squared, body, states.minus(prediction.states), prediction.information)
+        contradicted = mean_by_body(observations.misfit(residuals) > MAX_CHI2, body, n) > CONTRADICTED
+        rows = np.flatnonzero(contradicted)
         if len(rows):
             states = states.with_rows(rows, prediction.states.select(rows))
-        n_rejected = len(body) - int(fits.sum())
-        return RobustFit(states, assignments.select(fits), prediction, squared[fits], n_rejected)
+        count = np.bincount(body, minlength=n)
+        return RobustFit(states, assignments.select(~contradicted[body]), prediction, detections, cost, count)
 
-    def _leave_one_out(
-        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments, fitted: RobustFit
-    ) -> RobustFit:
+    def _without(self, k: int, fitted: RobustFit, assignments: Assignments) -> RobustFit:
+        camera = fitted.detections.camera[assignments.detection]
+        return self._fit(fitted.prediction, fitted.detections, assignments.select(camera != k))
+
+    def _left_out_again(self, fitted: RobustFit, assignments: Assignments) -> RobustFit | None:
+        """The fit without the camera that was left out before, while that one does not agree with it."""
+        if self._left_out is None:
+            return None
+        again = self._without(self._left_out, fitted, assignments)
+        cost, count = float((fitted.cost - again.cost).sum()), int((fitted.count - again.count).sum())
+        return None if self._is_unusual(again) or self._residuals.is_explained(cost, count) else again
+
+    def _leave_one_out(self, fitted: RobustFit, assignments: Assignments) -> RobustFit | None:
         """The fit without the camera that contradicts predictions and all others, if there is one."""
-        camera = detections.camera[assignments.detection]
-        without = {
-            k: self._fit(prediction, detections, assignments.select(camera != k))
-            for k in np.unique(camera).tolist()
-        }
-        at_fault = camera_at_fault(fitted.cost, {k: fit.cost for k, fit in without.items()})
-        if at_fault is None:
-            self._residuals.learn(fitted.assignments.squared_px)
-            return fitted
-        return without[at_fault]
+        camera = fitted.detections.camera[assignments.detection]
+        fits = {k: self._without(k, fitted, assignments) for k in np.unique(camera).tolist()}
+        costs = {k: float(fit.cost.sum()) for k, fit in fits.items()}
+        self._left_out = camera_at_fault(float(fitted.cost.sum()), costs)
+        return (
+            None if self._left_out is None or self._is_unusual(fits[self._left_out]) else fits[self._left_out]
+        )
 
-    def _without_incompatible(self, fitted: RobustFit, detections: DetectionTable) -> RobustFit:
+    def _with_noise(self, fitted: RobustFit, assignments: Assignments, last_px2: float) -> RobustFit:
+        """The fit with as much noise as makes it usual, not much less than the frame set before had."""
+        cov = fitted.detections.cov
+        self.added_px2 = max(last_px2 / 2, float((cov[0, 0] + cov[1, 1]).mean() / 2))
+        while self._is_unusual(
+            again := self._fit(fitted.prediction, self.noisy(fitted.detections), assignments)
+        ):
+            self.added_px2 *= 2
+            if self.added_px2 > MAX_ADDED_PX2:
+                break
+        return again
+
+    def noisy(self, detections: DetectionTable) -> DetectionTable:
+        """Detections with the noise that the last update gave them."""
+        cov = detections.cov + self.added_px2 * np.eye(2)[:, :, None]
+        return replace(detections, cov=cov) if self.added_px2 else detections
+
+    def _without_incompatible(self, fitted: RobustFit) -> RobustFit:
         """The fit to detections that do not contradict the others of their robots; all keep their residuals.
 
         A robot whose compatible detections fit already stays as it is: the others have hardly any weight.
         """
-        slack_px, robot = self._residuals.slack_px, self._markers.robot[fitted.assignments.marker]
+        slack_px = float(np.hypot(self._residuals.slack_px, np.sqrt(self.added_px2)))
+        detections, robot = fitted.detections, self._markers.robot[fitted.assignments.marker]
         suspicious = fitted.assignments.squared_px > SUSPICIOUS * slack_px**2
         if not suspicious.any():
             return fitted
@@ -150,15 +195,9 @@ class RobustUpdate:
     ) -> RobustFit:
         """A fit with other states, and so other residuals of some rows of its assignments."""
         residuals = self._estimator.residuals_px(states, observations)
-        others = np.setdiff1d(np.arange(len(fitted.squared)), rows)
+        others = np.setdiff1d(np.arange(len(fitted.assignments)), rows)
         changed = fitted.assignments.select(rows).with_residuals(residuals)
-        return RobustFit(
-            states,
-            fitted.assignments.select(others).joined(changed),
-            fitted.prediction,
-            np.concatenate([fitted.squared[others], observations.misfit(residuals)]),
-            fitted.n_rejected,
-        )
+        return replace(fitted, states=states, assignments=fitted.assignments.select(others).joined(changed))
 
 
 MAX_DEVIATION = 13.8  # chi-square with 2 degrees of freedom, one in a thousand, as the gates of association

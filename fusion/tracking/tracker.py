@@ -8,13 +8,13 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Index, Mask
+from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, CameraArray, DetectionTable
 from fusion.model.robots import Robot
+from fusion.model.states import Snapshot
 from fusion.monitoring.camera_monitors import CameraMonitors
-from fusion.monitoring.clocks.time_search import Snapshot
-from fusion.monitoring.extrinsics_monitor import ExtrinsicsCorrection, TrackedScene
 from fusion.monitoring.frame_consistency import AssignedFrames
 from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
 from fusion.protocol.pose_messages import RobotPose
@@ -99,7 +99,9 @@ class Tracker:
         self.acquisition = Acquisition(self.cameras, self.estimator, shard.leads)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
-        self.monitors = CameraMonitors(self.cameras, self.table.markers, self.table.single)
+        self.monitors = CameraMonitors(
+            self.cameras, self.table.markers, self.table.single, densities, self.limits.sigma_floor_px
+        )
         self.claims = ClaimCheck(self.estimator, self.table.markers, self.table.names)
         self.geometry = GeometryCheck(self.table.names, self.table.single)
         diameters = np.array([robot.diameter_m for robot in robots.values()])
@@ -167,7 +169,8 @@ class Tracker:
         assignments = self._update_states(associated, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
-        self.geometry.note(summary.mean_px2)
+        if not self.robust.is_doubtful:
+            self.geometry.note(summary.mean_px2)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
         return Update(
@@ -181,17 +184,15 @@ class Tracker:
         update, found = self._acquire(update)
         table = self.table
         now = Snapshot(update.t_ns, table.states, table.tracked)
-        self.monitors.observe(now, update.detections, update.associated)
+        is_doubtful = self.robust.is_doubtful or self.monitors.is_doubtful(update.t_ns)
+        self.monitors.observe(now, update.detections, update.associated, is_doubtful)
         unlabeled = self._track_unlabeled(update, found.markers)
         return self._report(update, unlabeled, found.crowded)
 
-    def check_extrinsics(
-        self, frame_set: FrameSet, result: TrackingResult
-    ) -> tuple[ExtrinsicsCorrection, ...]:
-        """Compare the frames with the tracked robots; exclude moved cameras and apply recalibrated poses."""
-        table, seen_by = self.table, result.summary.robot_cameras
-        scene = TrackedScene(self.cameras, table.markers, table.states, table.tracked, seen_by)
-        return self.monitors.check_extrinsics(frame_set, scene, self.shard.leads)
+    def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection, ...]:
+        """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
+        now = Snapshot(frame_set.t_ns, self.table.states, self.table.tracked)
+        return self.monitors.check_extrinsics(frame_set, now, self.shard.leads, self.robust.is_doubtful)
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
@@ -237,14 +238,15 @@ class Tracker:
 
     def _summarize(self, detections: DetectionTable, assignments: Assignments) -> ObservationSummary:
         table = self.table
-        return ObservationSummary.of(
+        summary = ObservationSummary.of(
             self.cameras,
             table.markers,
             len(table.robots),
-            detections,
+            self.robust.noisy(detections),
             assignments,
-            self.limits.sigma_floor_px,
+            float(np.hypot(self.limits.sigma_floor_px, np.sqrt(self.robust.added_px2))),
         )
+        return replace(summary, common_error=summary.common_error * self.monitors.rig.widening**0.5)
 
     def _update_states(
         self, associated: AssociatedFrames, detections: DetectionTable, assignments: Assignments

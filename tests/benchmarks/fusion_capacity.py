@@ -168,9 +168,7 @@ class Queue:
                 done_ns = self.free_ns
             self.latencies_ms.append((done_ns - arrival_ns) * 1e-6)
             self._spend(lambda result=result: encode(result.markers))
-            self._spend(
-                lambda frame_set=frame_set, result=result: self.tracker.check_extrinsics(frame_set, result)
-            )
+            self._spend(lambda frame_set=frame_set, result=result: self.tracker.check_extrinsics(frame_set))
             self._done_ns.append(self.busy_ns)
             count = sum(pose.state == "tracked" for pose in result.poses)
             self.tracked.append(count / max(int(self.tracker.table.owned.sum()), 1))

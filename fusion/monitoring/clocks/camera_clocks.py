@@ -2,7 +2,7 @@
 """Monitors the clocks of the cameras: excludes a camera whose stamps jumped, finds by how much, and corrects them.
 
     arrival of a frame   -> `ArrivalMonitor`: its stamp jumped, or may?  -> excluded from this frame on
-    every frame set      -> `ClockComparison.jump`: one camera off?     -> excluded
+    the rig graph        -> a clock explains the robots               -> corrected
     an excluded camera   -> `find_time_shift`: by how much?             -> corrected and used again
     slow information     -> `ClockComparison.drifts`                    -> corrected while in use
 
@@ -21,12 +21,11 @@ from camera_node.foundation.arrays import Mask
 from camera_node.foundation.logs import about
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
+from fusion.model.states import Snapshot
 from fusion.monitoring.clocks.arrival_monitor import ArrivalMonitor
-from fusion.monitoring.clocks.clock_comparison import FAST_NS, ClockComparison
+from fusion.monitoring.clocks.clock_comparison import ClockComparison
 from fusion.monitoring.clocks.clock_drift import Drift
-from fusion.monitoring.clocks.time_offsets import Disagreement
-from fusion.monitoring.clocks.time_search import Snapshot, TimeShift, find_time_shift
-from fusion.monitoring.clocks.undecided_stamps import UndecidedStamps
+from fusion.monitoring.clocks.time_search import TimeShift, find_time_shift
 
 log = logging.getLogger("fusion")
 ClockState = Literal["correct", "excluded", "corrected"]
@@ -34,7 +33,6 @@ ClockState = Literal["correct", "excluded", "corrected"]
 MAX_DRIFT_S = 0.01  # largest change of a correction by a slow departure
 FOLLOWED_NS = 10_000_000_000  # after a departure, in which smaller ones of the same camera count
 REPORTED_NS = 500_000  # smallest correction that is reported; later ones when it has doubled
-KEPT_NS = 600_000_000  # of the frames of a camera in use, for a search at once
 MAX_KEPT = 200  # frames of an excluded camera
 SEARCH_NS = 100_000_000  # between searches
 MIN_EXPECTED = 16  # moving markers, for a decision
@@ -63,7 +61,7 @@ class _Clock:
     Attributes:
         correction_ns, sigma_s: added to its stamps, and the standard deviation.
         departed_ns: when it was last found to depart slowly.
-        frames: the last frames, with the present correction.
+        frames: the last ones of an excluded camera, with the present correction.
         since_ns: server time of the exclusion; 0 while the camera is in use.
         by_arrival: whether the arrival of its frames excluded it.
         searched_ns, trusted_ns: times of the last search, and until which no evidence of the same kind counts.
@@ -98,7 +96,6 @@ class CameraClocks:
         self._clocks = {name: _Clock() for name in cameras.names}
         self._arrivals = ArrivalMonitor(cameras.names)
         self._comparison = ClockComparison(cameras, markers, single)
-        self._undecided = UndecidedStamps(cameras.names)
         self._now_ns = 0
 
     @property
@@ -123,23 +120,23 @@ class CameraClocks:
         self._arrivals.observe(frame.camera, frame.t_ns, frame.received_ns)
         self._correct_all(self._arrivals.impossible_ns)
         self._exclude_jumped(frame.received_ns)
-        sigma_s = np.sqrt(
-            frame.clock_sigma_s**2 + clock.sigma_s**2 + self._undecided.sigma_s(self._now_ns) ** 2
-        )
-        frame = replace(frame, t_ns=frame.t_ns + clock.correction_ns, clock_sigma_s=float(sigma_s))
-        clock.frames.append(frame)
+        sigma_s = float(np.hypot(frame.clock_sigma_s, clock.sigma_s))
+        frame = replace(frame, t_ns=frame.t_ns + clock.correction_ns, clock_sigma_s=sigma_s)
         if clock.state == "excluded":
+            clock.frames.append(frame)
             if frame.received_ns > clock.since_ns + ALONE_NS:
                 self._search(frame.camera, frame.received_ns)
             return None
         if frame.t_ns > frame.received_ns + MAX_AHEAD_NS:
             return None
-        while clock.frames[0].t_ns < frame.t_ns - KEPT_NS:
-            clock.frames.popleft()
         return frame
 
     def observe(
-        self, now: Snapshot, detections: DetectionTable, assignments: Assignments, is_doubtful: bool = False
+        self,
+        now: Snapshot,
+        detections: DetectionTable,
+        assignments: Assignments,
+        is_doubtful: bool = False,
     ) -> None:
         """Compare the cameras in a frame set.
 
@@ -153,43 +150,19 @@ class CameraClocks:
         self._comparison.observe(now)
         if is_doubtful:
             self._comparison.forget_latest()
-        elif (found := self._comparison.jump(detections, assignments)) is not None:
-            self._exclude_contradicted(found)
-        departing = {k for k, clock in enumerate(self._clocks.values()) if self._departs(clock)}
-        for drift in self._comparison.drifts(departing):
-            self._correct_drift(drift)
+        else:
+            self._comparison.add(detections, assignments)
+            departing = {k for k, clock in enumerate(self._clocks.values()) if self._departs(clock)}
+            for drift in self._comparison.drifts(departing):
+                self._correct_drift(drift)
         for name in self.excluded:
             self._search(name, self._now_ns)
-
-    def suspects(self, name: str) -> bool:
-        """Whether time explains the last detections of a camera, which is then excluded here, or may explain them."""
-        clock = self._clocks[name]
-        if clock.state != "excluded":
-            shift = self._shift(name, clock)
-            if self._undecided.holds(self._now_ns):
-                return True
-            if shift is None or not shift.explains(MIN_EXPECTED) or shift.is_zero:
-                return False
-            self._exclude(clock, self._now_ns, KEPT_NS)
-            self._search(name, self._now_ns)
-        return True
 
     def reset(self, name: str) -> None:
         """Forget the clock of a camera that has another calibration."""
         self._clocks[name] = _Clock()
         self._arrivals.reset(name)
         self._comparison.forget()
-
-    def _exclude_contradicted(self, found: Disagreement) -> None:
-        """Exclude the cameras that the last frame sets contradict, if it is clear which ones these are."""
-        if not found.cameras:
-            self._undecided.note(found.spread_s, self._now_ns)
-            return
-        for k in found.cameras:
-            clock = self._clocks[self._cameras.names[k]]
-            if clock.state != "excluded" and self._now_ns > clock.trusted_ns:
-                self._exclude(clock, self._now_ns, FAST_NS)
-        self._comparison.forget_jumps()
 
     def _exclude_jumped(self, now_ns: int) -> None:
         """Exclude the cameras whose stamps jumped relative to the others, or may have, and use those whose did not."""
@@ -201,21 +174,18 @@ class CameraClocks:
             elif name in jumped and now_ns <= clock.trusted_ns:
                 self._arrivals.settle(name)
             elif name in jumped:
-                self._exclude(clock, now_ns, 0)
+                self._exclude(clock, now_ns)
                 clock.by_arrival = True
 
     def _departs(self, clock: _Clock) -> bool:
         """Whether a clock departed slowly from the others just now."""
         return bool(clock.departed_ns) and self._now_ns < clock.departed_ns + FOLLOWED_NS
 
-    def _exclude(self, clock: _Clock, now_ns: int, back_ns: int) -> None:
-        """Hold back the frames of a camera from now on; those of the last `back_ns` are searched too."""
+    def _exclude(self, clock: _Clock, now_ns: int) -> None:
+        """Hold back the frames of a camera from now on."""
         clock.state, clock.since_ns, clock.by_arrival = "excluded", now_ns, False
-        self._comparison.forget_since(now_ns - FAST_NS)
-        while clock.frames and clock.frames[0].t_ns < now_ns - back_ns:
-            clock.frames.popleft()
-        if not back_ns:
-            clock.frames.clear()
+        self._comparison.forget_since(now_ns)
+        clock.frames.clear()
         clock.searched_ns = now_ns
 
     def _shift(self, name: str, clock: _Clock) -> TimeShift | None:
@@ -261,6 +231,14 @@ class CameraClocks:
                 clock.state = "excluded" if clock.state == "excluded" else "corrected"
                 clock.frames.clear()
 
+    def correct(self, name: str, offset_s: float, sigma_s: float) -> None:
+        """Correct a camera whose clock the rig graph found to be off, unless its frames are searched for it already."""
+        clock = self._clocks[name]
+        if clock.state != "excluded":
+            clock.since_ns = self._now_ns
+            self._correct_jump(name, offset_s, sigma_s)
+            clock.since_ns = 0
+
     def _correct_jump(self, name: str, offset_s: float, sigma_s: float) -> None:
         clock = self._clocks[name]
         clock.correction_ns += round(offset_s * 1e9)
@@ -269,7 +247,7 @@ class CameraClocks:
         self._comparison.forget_since(clock.since_ns)
         clock.frames.clear()
         at = time.strftime("%H:%M:%S", time.localtime(clock.since_ns * 1e-9))
-        message = "camera %s: stamps jumped by %.0f ms at %s; excluded, then corrected by %.1f ms"
+        message = "camera %s: stamps jumped by %.0f ms at %s; corrected by %.1f ms"
         log.warning(message, name, -1e3 * offset_s, at, 1e3 * offset_s, extra=about(name))
 
     def _correct_drift(self, drift: Drift) -> None:
@@ -279,7 +257,7 @@ class CameraClocks:
         if clock.state == "excluded":
             return
         if abs(change_s) > MAX_DRIFT_S:
-            self._exclude(clock, self._now_ns, FAST_NS)
+            self._exclude(clock, self._now_ns)
             return
         clock.correction_ns += round(change_s * 1e9)
         clock.state, clock.sigma_s, clock.departed_ns = "corrected", drift.sigma_s, self._now_ns

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compares the clocks of the cameras of each frame set by the robots that move; docs/design/time_offsets.md.
+"""Compares the clocks of the cameras by the robots that move; docs/design/time_offsets.md.
 
-the last frame sets    -> `offset_information` -> a jump, at once
-0.1 s after each one   -> `DriftMonitor`       -> a slow departure
+0.1 s after a frame set   -> `offset_information` -> `DriftMonitor` -> a slow departure
 """
 
 from collections import deque
@@ -18,21 +17,14 @@ from fusion.model.observations import (
     MarkerTable,
     MatchedObservations,
 )
+from fusion.model.states import Snapshot
 from fusion.monitoring.clocks.clock_drift import HALF_NS, Drift, DriftMonitor, with_mean_velocities
-from fusion.monitoring.clocks.time_offsets import (
-    Disagreement,
-    OffsetInformation,
-    disagreement,
-    offset_information,
-)
-from fusion.monitoring.clocks.time_search import RANGE_S, Snapshot
+from fusion.monitoring.clocks.time_offsets import offset_information
+from fusion.monitoring.clocks.time_search import RANGE_S
 
-COMPARED_NS, CHECKED_NS = 45_000_000, 400_000_000  # between comparisons, and between searches for a drift
-LAGGED_NS = 130_000_000  # between comparisons for a drift, which wait for the motion after the frame set
-FAST_NS = 120_000_000  # of frame sets that show a jump
-# Of velocities, m/s: of a filter with wrong stamps, and of a mean velocity.
-JUMP_SIGMA_V, DRIFT_SIGMA_V = 0.5, 0.1
-JUMP_PX = 1.5  # RMS image motion that a jump must explain
+CHECKED_NS = 400_000_000  # between searches for a drift
+LAGGED_NS = 130_000_000  # between comparisons, which wait for the motion after the frame set
+DRIFT_SIGMA_V = 0.1  # of a mean velocity, m/s
 MAX_MARKERS = 96  # observations of a frame set that are compared
 MIN_SPEED_M_S = 0.03  # of a robot that is compared
 
@@ -52,10 +44,9 @@ class ClockComparison:
     def __init__(self, cameras: CameraArray, markers: MarkerTable, single: Mask) -> None:
         self._cameras, self._markers, self._single = cameras, markers, single
         self.history: deque[Snapshot] = deque()
-        self._fast: deque[tuple[int, OffsetInformation]] = deque()
         self._drifts = DriftMonitor()
         self._lagged: deque[tuple[Snapshot, MatchedObservations]] = deque()
-        self._now_ns = self._compared_ns = self._lagged_ns = self._checked_ns = 0
+        self._now_ns = self._lagged_ns = self._checked_ns = 0
 
     def observe(self, now: Snapshot) -> None:
         """Add the robots at the next frame set to the history."""
@@ -64,25 +55,15 @@ class ClockComparison:
         while self.history[0].t_ns < now.t_ns - (RANGE_S + 0.5) * 1e9:
             self.history.popleft()
 
-    def jump(self, detections: DetectionTable, assignments: Assignments) -> Disagreement | None:
-        """The cameras that the last frame sets contradict; None if there is none, or nothing is compared now.
-
-        Args:
-            detections: of the last observed frame set.
-            assignments: of the detections.
-        """
-        if self._now_ns < self._compared_ns + COMPARED_NS:
-            return None
-        self._compared_ns, now = self._now_ns, self.history[-1]
-        chosen = self._choose(now, detections, assignments)
-        if not len(chosen):
-            return None
-        observations = MatchedObservations.of(chosen, detections, self._markers)
-        if self._now_ns >= self._lagged_ns + LAGGED_NS:
+    def add(self, detections: DetectionTable, assignments: Assignments) -> None:
+        """Keep detections of the last observed frame set, if it is time, until the motion after it is known."""
+        if self._now_ns < self._lagged_ns + LAGGED_NS:
+            return
+        chosen = self._choose(self.history[-1], detections, assignments)
+        if len(chosen):
             self._lagged_ns = self._now_ns
-            self._lagged.append((now, observations))
-        info = offset_information(self._cameras, now.states, observations, self._single, JUMP_SIGMA_V)
-        return self._disagreement(info)
+            observations = MatchedObservations.of(chosen, detections, self._markers)
+            self._lagged.append((self.history[-1], observations))
 
     def drifts(self, departing: Collection[int]) -> list[Drift]:
         """The cameras that depart slowly from the others; empty most of the time, since this is searched for rarely.
@@ -116,13 +97,8 @@ class ClockComparison:
         self.forget_latest()
         self._drifts.forget_since(t_ns)
 
-    def forget_jumps(self) -> None:
-        """Drop the information about jumps."""
-        self._fast.clear()
-
     def forget_latest(self) -> None:
         """Drop the information of the last frame sets, which is not in the windows of drifts yet."""
-        self._fast.clear()
         self._lagged.clear()
 
     def _choose(self, now: Snapshot, detections: DetectionTable, assignments: Assignments) -> Assignments:
@@ -134,13 +110,3 @@ class ClockComparison:
         order = np.argsort(-speed * robots)
         fits = robots[order] & (np.cumsum(count[order]) <= max(MAX_MARKERS, count[order][:1].sum()))
         return assignments.select(np.isin(robot, order[fits]))
-
-    def _disagreement(self, info: OffsetInformation) -> Disagreement | None:
-        """What the last frame sets show together with this one."""
-        self._fast.append((self._now_ns, info))
-        while self._fast[0][0] < self._now_ns - FAST_NS:
-            self._fast.popleft()
-        total = OffsetInformation.none(len(self._cameras.names))
-        for _, part in self._fast:
-            total = total.plus(part)
-        return disagreement(total, JUMP_PX)

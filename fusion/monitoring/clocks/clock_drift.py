@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Mask
-from fusion.model.states import States
+from fusion.model.states import Snapshot, States
 from fusion.monitoring.clocks.time_offsets import Disagreement, OffsetInformation, contradiction
-from fusion.monitoring.clocks.time_search import Snapshot
 
 WINDOW_NS, WINDOW_PX = 500_000_000, 100.0  # smallest duration of a window, and smallest image motion in it
 MAX_WINDOWS, MAX_AGE_NS = 60, 60_000_000_000

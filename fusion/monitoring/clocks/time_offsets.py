@@ -198,24 +198,12 @@ def _firsts(sorted_indices: Index) -> Index:
     return np.flatnonzero(np.diff(sorted_indices, prepend=-1))
 
 
-def disagreement(info: OffsetInformation, min_shift_px: float) -> Disagreement | None:
-    """The cameras whose offsets differ from those of the others; None if none differs.
-
-    A common offset of all cameras is unobservable. So the smallest group of cameras is searched whose offsets, with
-    those of the others zero, explain as much as all offsets do.
-
-    Args:
-        info: of some frame sets.
-        min_shift_px: RMS image motion that an offset must explain: calibration errors explain less.
-    """
-    speed_px = np.sqrt(info.motion_px2 / np.maximum(info.count, 1))
-    return contradiction(*info.without_shifts(), speed_px, min_shift_px)
-
-
 def contradiction(
     M: Array, y: Array, motion_px: Array, min_shift_px: float, noise_chi2: float = 0.0
 ) -> Disagreement | None:
     """The smallest group of cameras whose parameters alone explain what all parameters together do.
+
+    A common parameter of all cameras is unobservable: those of the others are zero.
 
     Args:
         M, y: (C, C) and (C,) least squares about one parameter of each camera, M x = y.

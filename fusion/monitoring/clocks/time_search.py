@@ -14,7 +14,7 @@ import numpy as np
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import CameraArray, Exposures, MarkerTable
-from fusion.model.states import States
+from fusion.model.states import Snapshot, States
 
 RANGE_S = 1.25  # largest offset that is searched for
 BIN_S = 0.004
@@ -31,15 +31,6 @@ APART_PX2 = (
 NOISE_PX = 0.5  # of one vote
 SMALL_S = 0.002  # an offset below this is none
 MAX_ROBOTS = 6
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Snapshot:
-    """The robots at one time, `tracked` (R,) tells which of them are known."""
-
-    t_ns: int
-    states: States
-    tracked: Mask
 
 
 @dataclass(frozen=True, slots=True, eq=False)

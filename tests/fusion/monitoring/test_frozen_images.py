@@ -45,7 +45,7 @@ def run(arena: Arena, frames: list[CalibratedFrame]):
         for frame_set in synchronizer.take(frame.t_ns):
             result = tracker.track(frame_set)
             poses += result.poses
-            corrections += tracker.check_extrinsics(frame_set, result)
+            corrections += tracker.check_extrinsics(frame_set)
     assert corrections == []
     return poses, refused
 

@@ -54,7 +54,7 @@ class Pipeline:
         results = []
         for frame_set in self.synchronizer.take(received_ns):
             results.append(self.tracker.track(frame_set))
-            self.tracker.check_extrinsics(frame_set, results[-1])
+            self.tracker.check_extrinsics(frame_set)
         return results
 
     @property

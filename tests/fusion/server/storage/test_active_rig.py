@@ -149,7 +149,7 @@ def test_undo_of_a_correction_restores_the_camera_and_no_longer_monitors_it(tmp_
         )
         assert client.rig(DEADLINE_S) == GIVEN
         assert server.pipeline.tracker is not None
-        assert server.pipeline.tracker.monitors.extrinsics.pinned == {"cam1"}
+        assert server.pipeline.tracker.monitors.rig.pinned == {"cam1"}
         done = run_program("fusion", "redo", *where)
         assert re.fullmatch(r"redone on the server: cam1 .* mm \(.*\); changed cameras: cam1\n", done.stdout)
         done = run_program("fusion", "redo", *where)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Robots do not follow a camera that turns by a third of a degree, while nothing has decided about it yet."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.benchmarks.faults.virtual_arena import VirtualArena
+from tests.benchmarks.faults.world import CameraFault
+from tests.benchmarks.fusion_load import Load
+from tests.benchmarks.trust import RIGHT, ClaimJudge, place
+
+TURN_RAD = np.radians(0.3)
+
+
+@pytest.mark.parametrize("axis", range(2))
+def test_poses_stay_within_their_claims_before_a_camera_is_judged(tmp_path: Path, axis: int):
+    """4 px at one of three cameras are 25 mm at the robots: frames of different times would explain them by 5 m/s."""
+    load = Load(robots=4, cameras=3, hz=30.0, speed_m_s=0.5, crossing=True, seed=1)
+    with VirtualArena(tmp_path, load, judge=ClaimJudge) as arena:
+        arena.wait(1.5)
+        judge = arena.judge
+        assert isinstance(judge, ClaimJudge)
+        judge.begin()
+        turn = np.zeros(3)
+        turn[axis] = TURN_RAD
+        place(arena, {"cam0": CameraFault(turn_rad=(turn[0], turn[1], turn[2]))})
+        arena.wait(0.6)
+    assert len(judge.rows) == judge.received  # all are tracked
+    assert np.mean([ratio for _, _, ratio in judge.rows]) < RIGHT
