@@ -27,6 +27,8 @@ constexpr unsigned kFirstFits = 16;  // frames after which the tone curve is fit
 constexpr unsigned kFitInterval = 8;     // so many
 constexpr double kMedianSquare = 0.455;  // of a normal variable of variance 1
 constexpr double kMemory = 0.2;          // weight of a new frame
+constexpr size_t kMinWitnesses = 3;  // roundels that show a change of the camera, of which one may be wrong
+constexpr double kChanged = 9;  // median of squared changes over their variance: three standard deviations
 
 /// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
 /// mean of both; levels of 255.
@@ -84,6 +86,7 @@ void CameraModel::observe(const std::vector<Observation>& roundels, const ImageV
         all.push_back(fit);
         if (fit->unoccluded) whole.push_back(fit);
     }
+    if (contradicts(roundels)) forget();
     light_.learn(whole, image);
     learn_response(all);
     bend_.learn(whole, std::max(1.0, correlation_));
@@ -99,12 +102,14 @@ void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
             measured.push_back(estimate->power);
             tone_.include(estimate->sample);
         }
-    if (knows_tone_) learn_curvature(fits);
+    learn_curvature(fits);
     if (measured.empty()) return;
     const double exponent = exponent_in_use();
     const bool changed = learn_tone(std::move(measured));
+    is_new_ = false;
     learn_remainder(changed);
     if (!changed) return;
+    last_.clear();
     light_.scale(exponent_in_use() / exponent);
     if (ratios_) ratios_->forget_measurements();
 }
@@ -118,7 +123,8 @@ std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFi
     const double left = (fit.ratio - print.ratio) / by_curvature, curvature = left + fit.curvature;
     const double sigma = std::hypot(fit.ratio_sigma, print.sigma) / by_curvature;
     if (std::abs(curvature) + sigma > kMaxCurvature) return std::nullopt;
-    if (!print.is_exact() && (by_curvature > kMaxByCurvature || left < kMinAssumed)) return std::nullopt;
+    const bool is_other = left < kMinAssumed && !is_new_;
+    if (!print.is_exact() && (by_curvature > kMaxByCurvature || is_other)) return std::nullopt;
     const auto exponent = [&](double k) { return log_exponent_of(fit.dark, fit.bright, 0.5 + k / 4); };
     const double here = exponent(curvature);
     const double middle = fit.dark + (0.5 + curvature / 4) * fit.contrast();
@@ -159,8 +165,40 @@ void CameraModel::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
     correlation_ += gain * (median_of(&RoundelFit::correlation) - correlation_);
 }
 
+/// Whether the ratios of the last frame's roundels changed: those of prints do not, so the camera did.
+bool CameraModel::contradicts(const std::vector<Observation>& roundels) {
+    std::vector<double> scores;
+    std::vector<SeenRatio> seen;
+    for (const auto& [fit, track] : roundels) {
+        if (track < 0 || fit->outer.major < kMinDiameter || fit->clipped) continue;
+        const SeenRatio now{track, fit->ratio, square(fit->ratio_sigma) + square(Print::kPaper)};
+        const auto last = std::find_if(last_.begin(), last_.end(),
+                                       [&](const SeenRatio& ratio) { return ratio.track == track; });
+        if (last != last_.end())
+            scores.push_back(square(now.ratio - last->ratio) / (now.variance + last->variance));
+        seen.push_back(now);
+    }
+    last_ = std::move(seen);
+    return scores.size() >= kMinWitnesses && median_by(scores, [](double score) { return score; }) > kChanged;
+}
+
+/// Lets the next frames teach all but the prints anew.
+void CameraModel::forget() {
+    sigma_ = edge_noise_ = 0;
+    knows_tone_ = knows_curvature_ = false;
+    tone_ = {};
+    remainder_ = {};
+    light_ = {};
+    bend_ = {};
+    is_new_ = true;
+    if (ratios_) ratios_->forget_measurements();
+}
+
 void CameraModel::claim(RoundelFit& fit) const {
     fit.pose_cov = scaled(fit.pose_cov, std::max({1.0, fit.correlation, correlation_}));
+    const double displacement = surprise_ * square(kEdgeShift * fit.blur);
+    for (const size_t i : {2, 4})  // Axx and Ayy
+        for (const size_t j : {2, 4}) fit.pose_cov[i][j] += displacement;
     bend_.claim(fit);
 }
 
@@ -181,17 +219,22 @@ std::vector<double> CameraModel::recurring() const {
 /// chance alone does not widen the claims of a linear camera. A squared normal variable has the median 0.455.
 void CameraModel::learn_curvature(const std::vector<const RoundelFit*>& fits) {
     std::vector<double> excess;
+    double least = square(kMaxCurvature);  // variance of the exponent's own error, as a curvature
     for (const RoundelFit* fit : fits) {
         if (fit->outer.major < kMinDiameter || fit->clipped) continue;
         const Print& print = nearest_print(prints_, fit->ratio);
         const double by_curvature = ratio_by_curvature(*fit, print.ratio);
         const double curvature = (fit->ratio - print.ratio) / by_curvature;
         const double sigma = std::hypot(fit->ratio_sigma, print.sigma) / by_curvature;
-        if (std::abs(curvature) + sigma < kMaxCurvature)
-            excess.push_back(square(curvature) / kMedianSquare - 2 * square(sigma));
+        if (std::abs(curvature) + sigma >= kMaxCurvature) continue;
+        least = std::min(least, square(sigma));
+        excess.push_back(square(curvature) / kMedianSquare - 2 * square(sigma));
     }
+    surprise_ = 0;
     if (excess.empty()) return;
     const double variance = median_by(excess, [](double value) { return value; });
+    surprise_ = std::max({0.0, variance - curvature_, log_exponent_ == 0 ? 0 : least});
+    if (!knows_tone_) return;
     curvature_ += (knows_curvature_ ? kMemory : 1) * (std::max(0.0, variance) - curvature_);
     knows_curvature_ = true;
 }

@@ -73,6 +73,8 @@ class CameraModel {
     void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
     void learn_curvature(const std::vector<const RoundelFit*>& fits);
     bool learn_tone(std::vector<ToneEstimate> measured);
+    bool contradicts(const std::vector<Observation>& roundels);
+    void forget();
     void learn_response(const std::vector<const RoundelFit*>& fits);
     void set_exponent(double log_exponent);
 
@@ -88,6 +90,15 @@ class CameraModel {
     double sigma_ = 0;         // of the mean; 0 before the first measurement
     double edge_noise_ = 0, correlation_ = 1;
     double curvature_ = 0;  // variance
+    double surprise_ =
+        0;  // variance of a curvature that fits do not contain: what the last frame showed beyond the prior
+    /// The ratios of the roundels of the last frame.
+    struct SeenRatio {
+        int track;
+        double ratio, variance;
+    };
+    std::vector<SeenRatio> last_;
+    bool is_new_ = false;  // the last frame contradicted the model
     bool knows_tone_ = false, knows_curvature_ = false;
     std::array<uint8_t, 256> linear_;
     std::vector<uint8_t> buffer_;

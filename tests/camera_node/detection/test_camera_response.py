@@ -19,7 +19,7 @@ from tests.benchmarks.detector.cameras import (
     share_found,
     uncovered,
 )
-from tests.benchmarks.detector.models import faint_found
+from tests.benchmarks.detector.models import CHANGE_CLAIM, CHANGED, faint_found, size_claims_after_change
 from tests.benchmarks.detector.pictures import sight_of
 from tests.benchmarks.detector.recall import SIZE
 from tests.benchmarks.detector.table import Run
@@ -59,6 +59,14 @@ def test_a_detector_with_other_settings_keeps_what_it_learned_about_the_camera(m
 def test_one_picture_shows_what_its_camera_does_to_covered_roundels(sensor: Sensor, share: float):
     """Roundels that are all covered show tone curve and processing together. The first frame had 2 % of them."""
     assert share_found(Detector(), sensor, partial(covered, 0.2, False), 2) > share
+
+
+@pytest.mark.parametrize(("before", "after"), [("gamma 2.2", "linear"), ("linear", "gamma 2.2")])
+def test_a_camera_that_changes_is_claimed_at_once_and_known_in_ten_frames(before: str, after: str):
+    """Sizes are 1 to 2 % off in the first frame, 1,200 to 1,700 times the claim if what was learned is obeyed."""
+    first, *_, last = size_claims_after_change(RUN, CHANGED[before], CHANGED[after])
+    assert first < CHANGE_CLAIM
+    assert last < CHANGE_CLAIM / 2  # 3 if only the claims follow
 
 
 def test_contrast_is_judged_before_the_picture_is_made_linear():
