@@ -20,6 +20,7 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
+from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
 from calib.wand.quality.grade import RigQuality, assess
 from calib.wand.scale import SIGMA_M, Distance
 from calib.wand.wand_report import WandReport
@@ -68,11 +69,30 @@ class WandResult:
         rig: the cameras with poses, covariances and clock offsets; `rig.save("rig.yaml")` writes it.
         report: residuals, the length of the wand, and all that was left out, with the reasons.
         quality: the grade, A to D, and the expected error of points where the wand was.
+        poses: of the placed cameras, with the joint covariance that `compare` needs.
     """
 
     rig: Rig
     report: WandReport
     quality: RigQuality
+    poses: CameraPoses
+
+    def compare(self, other: "WandResult | Rig") -> Agreement:
+        """Test whether another calibration of the same cameras agrees, whatever the world frame of each is.
+
+        Args:
+            other: from another recording; or a rig, whose cameras have covariances.
+
+        Returns:
+            the test: `holds`, `shift_mm` and `turn_deg` by camera after the best rigid motion of the world, `moved`,
+            and `sentence()`.
+
+        Raises:
+            CalibrationError: fewer than two cameras are in both.
+        """
+        return compare_calibrations(
+            self.poses, other.poses if isinstance(other, WandResult) else CameraPoses.of_rig(other)
+        )
 
     @property
     def grade(self) -> str:
@@ -168,7 +188,12 @@ def calibrate_wand(
     figures = {**_provenance("calibrate_wand"), **quality.as_dict(), **result.as_dict()}
     if "lenses" in lenses.calibration:
         figures["lenses"] = lenses.calibration["lenses"]
-    return WandResult(msgspec.structs.replace(result.rig, calibration=figures), result.report, quality)
+    return WandResult(
+        msgspec.structs.replace(result.rig, calibration=figures),
+        result.report,
+        quality,
+        CameraPoses.of_calibration(result),
+    )
 
 
 def track(

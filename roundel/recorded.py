@@ -17,7 +17,8 @@ from camera_node.detection.detector import SettingKeywords
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
 from camera_node.protocol.messages import Detections, MessageError, decode
-from camera_node.sources.recorded_detections import detect_frames, read_observations
+from camera_node.sources.recorded_detections import detect_frames, detect_video, read_observations
+from camera_node.sources.recorded_frames import VIDEOS
 from fusion.export.plots import draw_recording, read_curves
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import RobotPose, Robots
@@ -81,8 +82,10 @@ class Recording:
             - an MCAP file of `roundel record`, of the page, or of a wand calibration (`rig.wave.mcap`);
             - a folder of frames `<camera>/<t_ns>.png|jpg`, as `simulate` writes it: the roundels of all frames are
               detected when they are first asked for. It may hold a `rig.yaml` and a `robots.yaml`;
+            - a video (`.mp4`, `.avi`, `.mkv`, `.mov`) of a camera of its name, with the times of a `timestamps.csv`
+              beside it, or from 0 by its frame rate;
             - `observations.csv` with the columns `t_ns,camera,u,v` and optionally `marker` and `sigma_px`.
-        settings: of `Detector`, for a folder of frames.
+        settings: of `Detector`, for frames and videos.
 
     Attributes:
         path: the file or folder.
@@ -221,9 +224,13 @@ class Recording:
         return self.path.is_dir()
 
     @property
+    def _is_video(self) -> bool:
+        return self.path.suffix.lower() in VIDEOS
+
+    @property
     def is_mcap(self) -> bool:
         """Whether it is a file of messages, not of frames or of observations."""
-        return not self._is_folder and self.path.suffix.lower() != ".csv"
+        return not (self._is_folder or self._is_video) and self.path.suffix.lower() != ".csv"
 
     def _decoded(self, suffix: str, kind: type) -> Iterator[tuple[int, Any]]:
         """Yield the time of arrival and the content of the messages on keys that end with `suffix`."""
@@ -246,7 +253,7 @@ class Recording:
         """
         if self.is_mcap:
             yield from self._decoded("/detections", Detections)
-        elif self._is_folder:
+        elif self._is_folder or self._is_video:
             yield from as_they_arrived(self._detected, rig.cameras if rig else {})
         else:
             cameras = (rig or self.rig or Rig(cameras={})).cameras
@@ -255,6 +262,8 @@ class Recording:
 
     @cached_property
     def _detected(self) -> list[Detections]:
+        if self._is_video:
+            return list(detect_video(self.path, **self._settings))
         return detect_frames(self.path, **self._settings)
 
     @cached_property

@@ -9,10 +9,11 @@ import numpy as np
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
+from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import CameraError, ConfigError, unwritable
 from camera_node.foundation.terminal import track
 from camera_node.protocol.messages import Detections
-from camera_node.sources.recorded_frames import FrameFolder, inner_folders
+from camera_node.sources.recorded_frames import FrameFolder, VideoFile, inner_folders
 
 SIGMA_PX = 0.3  # assumed standard deviation of a centre from a file without covariances
 MAX_FPS = 1e5
@@ -58,6 +59,23 @@ def detect_frames(folder: Path, **settings) -> list[Detections]:
         for name, seq, frame in track(frames, f"detecting in {folder}", sum(map(len, sources.values())))
     ]
     return sorted(messages, key=lambda message: message.t_ns)
+
+
+def detect_video(path: Path, **settings) -> Iterator[Detections]:
+    """Detect roundels in a video, frame by frame; the camera has the file's name without its suffix.
+
+    Args:
+        path: the video; a `timestamps.csv` beside it has the capture times, else the frame rate gives them from 0.
+        settings: keyword arguments of `Detector`.
+
+    Raises:
+        CameraError: OpenCV can't read the file.
+    """
+    detector, camera = Detector(**settings), require_name(path.stem, "a camera")
+    for seq, frame in enumerate(VideoFile(path)):
+        height, width = frame.image.shape
+        found = detector.detect(frame.image)
+        yield Detections.pack(found, camera=camera, seq=seq, t_ns=frame.t_ns, width=width, height=height)
 
 
 def read_observations(

@@ -18,6 +18,7 @@ from camera_node.protocol.registration import CameraAssignment
 from camera_node.sources.frame import Frame, Source, SourceSettings
 from camera_node.sources.grey import to_grey
 
+VIDEOS = (".mp4", ".avi", ".mkv", ".mov")
 IMAGES = (".png", ".jpg", ".jpeg")  # suffixes of files that hold one frame
 
 

@@ -44,6 +44,7 @@ def moving_pose(robot: str, t_ns: int, seed: int = 1, state: str = "tracked") ->
         angular_velocity=tuple(axis.tolist()),
         covariance=(A @ A.T).astype("<f4").tobytes(),
         n_markers=3,
+        acceleration_density=(1.0, 1.0),
     )
 
 
