@@ -37,19 +37,44 @@ def triangulate_point(cameras: Sequence[Camera], uv: ArrayLike) -> Array:
     Raises:
         CalibrationError: the rays are too close to parallel to fix a point, or they meet behind the cameras.
     """
-    uv = np.asarray(uv, float)
-    poses = [camera.matrix() for camera in cameras]
-    p = _nearest_to_rays(cameras, poses, uv)
-    for _ in range(ITERATIONS):
-        J, r = _linearize(cameras, poses, uv, p)
-        if not np.isfinite(J).all():
-            break
-        step = np.linalg.lstsq(J, r)[0]
-        p = p + step
-        if np.abs(step).max() < CONVERGED_M:
-            break
+    p = triangulate_points(cameras, np.asarray(uv, float)[:, None])[0]
     if not np.isfinite(p).all():
-        raise CalibrationError("the viewing rays meet behind the cameras")
+        raise CalibrationError(
+            "the viewing rays are too close to parallel to fix a point, or they meet behind the cameras"
+        )
+    return p
+
+
+def triangulate_points(cameras: Sequence[Camera], uv: Array) -> Array:
+    """Locate points as `triangulate_point`, all at once.
+
+    Args:
+        cameras: C placed cameras.
+        uv: (C, N, 2) raw pixels; NaN where a camera did not see a point.
+
+    Returns:
+        (N, 3) world, metres; NaN where the rays do not fix a point, or meet behind the cameras.
+    """
+    p = _nearest_to_rays(cameras, uv)
+    moving = np.flatnonzero(np.isfinite(p).all(axis=1))
+    for _ in range(ITERATIONS):
+        A, b = np.zeros((len(moving), 3, 3)), np.zeros((len(moving), 3))
+        for camera, pixels in zip(cameras, uv[:, moving], strict=True):
+            seen, T = np.isfinite(pixels).all(axis=1), camera.matrix()
+            predicted, J = camera.project_with_jacobian(transform(invert(T), p[moving[seen]]))
+            J = J @ T[:3, :3].T
+            A[seen] += J.mT @ J
+            b[seen] += np.einsum("nki,nk->ni", J, pixels[seen] - predicted)
+        # A point that runs away between nearly parallel rays has no solution; one behind a camera has no image.
+        spread = np.linalg.eigvalsh(np.nan_to_num(A))
+        fixed = np.isfinite(A).all(axis=(1, 2)) & (spread[:, 0] > np.finfo(float).eps * spread[:, 2])
+        p[moving[~fixed]] = np.nan
+        moving, A, b = moving[fixed], A[fixed], b[fixed]
+        step = np.linalg.solve(A, b[:, :, None])[:, :, 0]
+        p[moving] += step
+        moving = moving[np.abs(step).max(axis=1) >= CONVERGED_M]
+        if not len(moving):
+            break
     return p
 
 
@@ -74,25 +99,20 @@ def intersect(ray: Array, centre: Array, known: Mask, rounds: int = REWEIGHTINGS
     return points, angle
 
 
-def _nearest_to_rays(cameras: Sequence[Camera], poses: Sequence[Array], uv: Array) -> Array:
-    A, b = np.zeros((3, 3)), np.zeros(3)
-    for camera, T, pixel in zip(cameras, poses, uv, strict=True):
-        d = T[:3, :3] @ camera.rays(pixel)[0]
-        across = np.eye(3) - np.outer(d, d)
-        A, b = A + across, b + across @ T[:3, 3]
-    if not np.isfinite(A).all() or np.linalg.eigvalsh(A)[0] < MIN_ANGLE**2:
-        raise CalibrationError("the viewing rays are too close to parallel to fix a point")
-    return np.asarray(np.linalg.solve(A, b), float)
-
-
-def _linearize(cameras: Sequence[Camera], poses: Sequence[Array], uv: Array, p: Array) -> tuple[Array, Array]:
-    """Jacobian (2N, 3) of the pixels by the point, and residuals (2N,): observed less predicted pixels."""
-    jacobians, residuals = [], []
-    for camera, T, pixel in zip(cameras, poses, uv, strict=True):
-        predicted, J = camera.project_with_jacobian(transform(invert(T), p))
-        jacobians.append(J[0] @ T[:3, :3].T)
-        residuals.append(pixel - predicted[0])
-    return np.vstack(jacobians), np.concatenate(residuals)
+def _nearest_to_rays(cameras: Sequence[Camera], uv: Array) -> Array:
+    """(N, 3) points nearest to the rays of pixels (C, N, 2); NaN where these are nearly parallel."""
+    A, b = np.zeros((uv.shape[1], 3, 3)), np.zeros((uv.shape[1], 3))
+    for camera, pixels in zip(cameras, uv, strict=True):
+        seen, T = np.isfinite(pixels).all(axis=1), camera.matrix()
+        d = camera.rays(pixels[seen]) @ T[:3, :3].T
+        across = np.eye(3) - d[:, :, None] * d[:, None]
+        A[seen] += across
+        b[seen] += across @ T[:3, 3]
+    known = np.flatnonzero(np.isfinite(A).all(axis=(1, 2)))
+    known = known[np.linalg.eigvalsh(A[known])[:, 0] >= MIN_ANGLE**2]
+    p = np.full(b.shape, np.nan)
+    p[known] = np.linalg.solve(A[known], b[known][:, :, None])[:, :, 0]
+    return p
 
 
 @dataclass(frozen=True, slots=True)

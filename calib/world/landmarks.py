@@ -18,7 +18,7 @@ import numpy as np
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, transform
 from calib.rig.rig import Rig
-from calib.rig.triangulation import triangulate_point
+from calib.rig.triangulation import triangulate_points
 from calib.world.still_roundels import StillRoundel, disc_centres, find_still_roundels
 from calib.world.world_frame import align_positions, align_standing_wand, check_above, is_collinear
 from camera_node.foundation.arrays import Array
@@ -228,17 +228,15 @@ def _list_distances(points: Array) -> str:
 def _triangulate_pairs(cameras: Mapping[str, Camera], roundels: Sequence[StillRoundel]) -> Array:
     """(N, 3) points where the rays of two cameras meet: most are wrong pairs, but all true points are included."""
     points = []
-    for a, b in combinations(roundels, 2):
-        if a.camera == b.camera:
-            continue
-        pair = [cameras[a.camera], cameras[b.camera]]
-        try:
-            p = triangulate_point(pair, [a.uv, b.uv])
-        except CalibrationError:
-            continue
-        distances = [np.linalg.norm(c.project_world(p)[0] - r.uv) for c, r in zip(pair, (a, b), strict=True)]
-        if max(distances) < FIT_PX:
-            points.append(p)
+    own = {name: np.array([r.uv for r in roundels if r.camera == name]).reshape(-1, 2) for name in cameras}
+    for a, b in combinations(cameras, 2):
+        pair, count = [cameras[a], cameras[b]], (len(own[a]), len(own[b]))
+        uv = np.array([np.repeat(own[a], count[1], axis=0), np.tile(own[b], (count[0], 1))])
+        found = triangulate_points(pair, uv)
+        off = [
+            np.linalg.norm(c.project_world(found) - seen, axis=1) for c, seen in zip(pair, uv, strict=True)
+        ]
+        points += list(found[np.max(off, axis=0) < FIT_PX])  # False for NaN
     return _merge_points(points)
 
 
@@ -284,21 +282,30 @@ def _rows_with_distances(distances: Array, chosen: Array) -> Iterator[tuple[int,
 def _match(
     cameras: Mapping[str, Camera], roundels: Sequence[StillRoundel], landmarks: Mapping[str, Array]
 ) -> _Hypothesis:
-    """Match each landmark (3,), in the rig's world, with the nearest roundel of every camera, if it is near enough."""
+    """Match each landmark (3,), in the rig's world, with the nearest roundel of every camera, if it is near enough.
+
+    Two cameras see a point wherever the rays of different roundels meet. So where a camera sees a roundel that is none
+    of the landmarks in place of one, more than two must see that landmark.
+    """
     matches: dict[str, list[StillRoundel]] = {name: [] for name in landmarks}
     matched_px: dict[str, list[float]] = {name: [] for name in landmarks}
+    against = dict.fromkeys(landmarks, 0)
     for camera_name, camera in cameras.items():
         own = [r for r in roundels if r.camera == camera_name]
         if not own:
             continue
         uv = camera.project_world(np.array(list(landmarks.values())))
         distances = np.linalg.norm(uv[:, None] - np.array([r.uv for r in own])[None], axis=2)
-        for name, row in zip(landmarks, distances, strict=True):
-            k = int(np.nanargmin(row)) if np.isfinite(row).any() else -1
-            if k >= 0 and row[k] < FIT_PX:
-                matches[name].append(own[k])
-                matched_px[name].append(float(row[k]))
-    counted = [px for px in matched_px.values() if len(px) >= 2]
+        distances = np.nan_to_num(distances, nan=np.inf)
+        free = ~(distances < FIT_PX).any(axis=0)
+        extent = float(np.nan_to_num(np.linalg.norm(uv[:, None] - uv, axis=2)).max())
+        for name, row, inside in zip(landmarks, distances, camera.sees(uv), strict=True):
+            if row.min() < FIT_PX:
+                matches[name].append(own[int(row.argmin())])
+                matched_px[name].append(float(row.min()))
+            elif inside and (row[free] < extent).any():
+                against[name] += 1
+    counted = [px for name, px in matched_px.items() if len(px) >= max(2, 2 * against[name] + 1)]
     distance_px = float(np.mean(np.concatenate(counted))) if counted else np.inf
     return _Hypothesis(len(counted), distance_px, matches)
 
@@ -319,9 +326,17 @@ def _check_unique(hypotheses: Sequence[_Hypothesis], of: str) -> None:
 def _triangulate(
     cameras: Mapping[str, Camera], matches: Mapping[str, Sequence[StillRoundel]]
 ) -> dict[str, Array]:
-    located = {}
-    for name, found in matches.items():
-        seeing = [cameras[r.camera] for r in found]
-        if len({r.camera for r in found}) >= 2:
-            located[name] = triangulate_point(seeing, disc_centres(seeing, found))
-    return located
+    number = {name: k for k, name in enumerate(cameras)}
+    uv = np.full((len(cameras), len(matches), 2), np.nan)
+    for column, found in enumerate(matches.values()):
+        rows = [number[r.camera] for r in found]
+        uv[rows, column] = disc_centres([cameras[r.camera] for r in found], found)
+    seen = np.isfinite(uv).all(axis=2).sum(axis=0) >= 2
+    names = [name for name, enough in zip(matches, seen, strict=True) if enough]
+    points = triangulate_points(list(cameras.values()), uv[:, seen])
+    if np.isnan(points).any():
+        lost = names[int(np.isnan(points[:, 0]).argmax())]
+        raise CalibrationError(
+            f"the viewing rays of '{lost}' are nearly parallel, or meet behind the cameras"
+        )
+    return dict(zip(names, points, strict=True))

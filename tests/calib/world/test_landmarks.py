@@ -15,6 +15,7 @@ from calib.world.world_frame import align_positions, align_standing_wand, check_
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
+from camera_node.geometry.pose import rotation_from_vector
 from tests.calib.synthetic import ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world, see_discs
 from tests.conftest import ROOT
@@ -144,3 +145,23 @@ def test_the_shipped_frame_fixes_a_world():
     check_above(moved, landmarks)
     for name, camera in moved.cameras.items():
         assert camera.matrix() == pytest.approx(arena.truth.cameras[name].matrix(), abs=2e-3)
+
+
+@pytest.mark.parametrize("cameras", [3, 4])
+@pytest.mark.parametrize("legs", [(0.36, 0.5), (0.3, 0.6), (0.6, 0.5), (0.33, 0.5)])
+def test_roundels_at_other_distances_than_the_file_are_refused(cameras: int, legs: tuple[float, float]):
+    """Where rays of different roundels meet, points have the distances of the file: two cameras see them, the others
+    see a roundel elsewhere. Laid as the file says, they are located."""
+    arena = ring(cameras)
+    file = {"0": np.zeros(3), "1": np.array([0.3, 0.0, 0.0]), "2": np.array([0.0, 0.5, 0.0])}
+    for turn in np.linspace(0, 6, 4):
+        R = rotation_from_vector([0, 0, turn])
+        laid = {"0": [0, 0, 0], "1": [legs[0], 0, 0], "2": [0, legs[1], 0]}
+        wrong = {name: (R @ at + [0.2, 0.1, 0]).tolist() for name, at in laid.items()}
+        with pytest.raises(CalibrationError, match="have the distances of"):
+            locate_landmarks(arena.truth.placed(), find_still_roundels(detect_landmarks(arena, wrong)), file)
+        right = {name: (R @ at + [0.2, 0.1, 0]).tolist() for name, at in file.items()}
+        located = locate_landmarks(
+            arena.truth.placed(), find_still_roundels(detect_landmarks(arena, right)), file
+        )
+        assert max(np.linalg.norm(located[name] - right[name]) for name in file) < 1e-3
