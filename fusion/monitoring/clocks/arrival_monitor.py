@@ -117,12 +117,18 @@ class ArrivalMonitor:
         }
         changed = {name for name in self._cameras if self._cameras[name].has_changed}
         self._shared = max((self._alike(name, changed & active) for name in changed), key=len, default=set())
-        if 2 * len(self._shared) <= len(active):
+        if 2 * len(self._shared) <= len(active) or (self._shared < active and self._is_impossible()):
             self._shared = set()
         self.jumped = frozenset(active - self._shared if self._shared else changed)
         if self._shared and not self.jumped:
             self._settle_all()
         self.undecided = self._undecided_of(active)
+
+    def _is_impossible(self) -> bool:
+        """Whether the frames of the shared change arrive before their stamps: however many, their stamps are wrong."""
+        checks = [self._cameras[name].check for name in self._shared]
+        is_timed = all(check.is_timed for check in checks)
+        return is_timed and bool(np.median([check.lag_ns for check in checks]) < -MAX_CLOCK_ERROR_NS)
 
     def _undecided_of(self, active: set[str]) -> frozenset[str]:
         """The active cameras that may have jumped; a pause that more than half of them share is none of theirs."""
@@ -144,13 +150,14 @@ class ArrivalMonitor:
 
     def _settle_all(self) -> None:
         """All cameras changed alike."""
-        shared_ns, checks = self._shared_ns(), [self._cameras[name].check for name in self._shared]
+        shared_ns, is_impossible = self._shared_ns(), self._is_impossible()
+        is_timed = all(self._cameras[name].check.is_timed for name in self._shared)
         for camera in self._cameras.values():
             camera.has_changed, camera.earlier_ns = False, 0.0
         self._shared = set()
-        if not all(check.is_timed for check in checks):
+        if not is_timed:
             return
-        if np.median([check.lag_ns for check in checks]) < -MAX_CLOCK_ERROR_NS:
+        if is_impossible:
             self.impossible_ns = shared_ns
         done = f"corrected by {-shared_ns * 1e-6:.0f} ms" if self.impossible_ns else "not corrected"
         log.warning("the stamps of all cameras jumped by %.0f ms together; %s", shared_ns * 1e-6, done)

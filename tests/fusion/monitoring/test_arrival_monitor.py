@@ -29,13 +29,15 @@ def after_jumps(jumps_ms: dict[str, float], n_frames: int = 5) -> ArrivalMonitor
 @pytest.mark.parametrize("jump_ms", [25.0, 400.0, -400.0])
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_the_cameras_that_differ_from_most_jumped(jump_ms: float, n: int):
-    """Of n cameras that jump alike, all did if they are half or less, the others by the opposite if they are more."""
+    """Of n cameras that jump alike, all did if they are half or less, the others by the opposite if they are more. But
+    frames can't arrive before their stamps: three of four clocks of one hub that are ahead are wrong themselves."""
     for group in map(set, combinations(NAMES, n)):
         monitor = after_jumps(dict.fromkeys(group, jump_ms))
-        expected = group if n <= 2 else set(NAMES) - group
+        jumped = n <= 2 or (n == 3 and jump_ms > 0)
+        expected = group if jumped else set(NAMES) - group
         assert monitor.jumped == expected
         for name in expected:
-            assert monitor.jump_ns(name) == pytest.approx(jump_ms * 1e6 * (1 if n <= 2 else -1), abs=5e6)
+            assert monitor.jump_ns(name) == pytest.approx(jump_ms * 1e6 * (1 if jumped else -1), abs=5e6)
         for name in expected:
             monitor.settle(name)
         assert not monitor.jumped
