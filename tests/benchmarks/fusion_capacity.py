@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Capacity of one core: `python -m tests.benchmarks.fusion_capacity [--robots 60 100 150]`, 15 s a load.
 
-The server's path from the bytes of messages to the bytes of poses, without the network.
+The server's path from the bytes of messages to the bytes of poses, without the network, and without the process that
+judges the cameras.
 
 Simulates a queue with one server by measured processor times: a message arrives `DELAY_NS` after its exposure and waits
 until the earlier ones are done. The latency of a frame set counts from the arrival of the message that completes it.
@@ -24,6 +25,7 @@ from camera_node.protocol.messages import Detections, decode, encode
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.protocol.pose_messages import Latency, RobotPose, ShardPoses
 from fusion.protocol.shards import Shard
+from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server import collecting_between_frame_sets
 from fusion.tracking.association import AssociatedFrames
@@ -113,6 +115,7 @@ class Queue:
     def __init__(self, load: Load, seconds: float, shard: Shard = Shard(), pace: float = 1.0) -> None:  # noqa: B008 frozen
         self.load, self.pace = load, pace
         self.tracker = Tracker(load.rig, load.bodies, shard=shard)
+        self.tracker.monitors.rig.executor = JudgeProcess()
         self.synchronizer = FrameSynchronizer(round(1e9 / load.hz))
         self.free_ns = self.busy_ns = self._first_ns = self._collected_ns = 0
         room = math.ceil((seconds + 1) * load.hz)
