@@ -5,6 +5,7 @@ Messages are in MessagePack as on the wire. `log_time` is the time of arrival, i
 messages of an arena's recording are defined by fusion (`fusion.recordings.arena_recording`).
 """
 
+import contextlib
 import io
 import logging
 import os
@@ -138,6 +139,26 @@ def read_messages(
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
 
 
+@contextlib.contextmanager
+def new_recording(path: Path, overwrite: bool = True) -> Iterator[RecordingWriter]:
+    """A writer of a recording that appears at `path` complete at the end, or not at all after an error.
+
+    Raises:
+        ConfigError: `path` exists and is not to be replaced, its folder can't be written to, or the disk is full.
+    """
+    if not overwrite and path.exists():
+        raise ConfigError(f"{path} exists; give another name, or --force to replace it")
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with RecordingWriter(part) as writer:
+            yield writer
+        os.replace(part, path)
+    except OSError as error:
+        raise unwritable(path, error) from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def wand_recording_path(rig: Path) -> Path:
     """The path of the wand recording from which the rig file `rig` is calibrated."""
     return rig.with_name(f"{rig.stem}.wave.mcap")
@@ -152,17 +173,11 @@ def save_wand_recording(path: Path, arena: str, messages: Iterable[Detections]) 
     Raises:
         ConfigError: the folder can't be written to, or the disk is full.
     """
-    part, keys = path.with_name(f".{path.name}.part"), Keys(arena)
-    try:
-        with RecordingWriter(part) as writer:
-            for message in messages:
-                writer.put(keys.detections(message.camera), encode(message), message.t_ns)
+    keys = Keys(arena)
+    with new_recording(path) as writer:
+        for message in messages:
+            writer.put(keys.detections(message.camera), encode(message), message.t_ns)
         backup = History(path).back_up()
-        os.replace(part, path)
-    except OSError as error:
-        raise unwritable(path, error) from None
-    finally:
-        part.unlink(missing_ok=True)
     return backup
 
 

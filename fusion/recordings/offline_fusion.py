@@ -7,7 +7,6 @@ times of arrival.
 """
 
 import heapq
-import os
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -16,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from calib.rig.camera import Camera
-from calib.rig.recording import RecordingWriter, as_they_arrived, read_messages
+from calib.rig.recording import as_they_arrived, new_recording, read_messages
 from calib.rig.rig import load_rig
-from camera_node.foundation.errors import ConfigError, unwritable
+from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.recorded_detections import detect_frames, read_observations
 from fusion.errors import FusionError
@@ -308,17 +307,10 @@ def write_recording(source: Path, out: Path, fused: Iterable[TrackingResult]) ->
     Raises:
         ConfigError: the folder of `out` can't be written to, or the disk is full.
     """
-    part = out.with_name(f".{out.name}.part")
     old = (e for e in read_messages(source, Counter()) if not e[0].endswith(("/pose", "/markers")))
-    try:
-        with RecordingWriter(part) as writer:
-            for entry in heapq.merge(old, _entries(source, fused), key=lambda entry: entry[2]):
-                writer.put(*entry)
-        os.replace(part, out)
-    except OSError as error:
-        raise unwritable(out, error) from None
-    finally:
-        part.unlink(missing_ok=True)
+    with new_recording(out) as writer:
+        for entry in heapq.merge(old, _entries(source, fused), key=lambda entry: entry[2]):
+            writer.put(*entry)
 
 
 def _entries(source: Path, fused: Iterable[TrackingResult]) -> Iterator[tuple[str, bytes, int]]:

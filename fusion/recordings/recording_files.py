@@ -3,11 +3,12 @@
 
 import re
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.rig.recording import RecordingWriter, read_messages
+from calib.rig.recording import new_recording, read_messages
 from calib.rig.recording_reader import RecordingReader
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import ConfigError
@@ -141,23 +142,31 @@ def trim_recording(
     if not 0 <= from_s < to_s:
         raise ConfigError(f"a part from {from_s:g} s to {to_s:g} s is empty; give --from-s below --to-s")
     faults = Counter[str]() if faults is None else faults
-    times = [t_ns for *_, t_ns in read_messages(recording, faults)] or [0]
-    start_ns, length_s = min(times), (max(times) - min(times)) / 1e9
+    start_ns, last_ns = 0, 0
+    for n, (*_, t_ns) in enumerate(read_messages(recording, faults)):
+        start_ns, last_ns = (min(start_ns, t_ns), max(last_ns, t_ns)) if n else (t_ns, t_ns)
     begin_ns, end_ns = (start_ns + round(s * 1e9) for s in (from_s, min(to_s, 1e9)))
+    with new_recording(out, overwrite) as writer:
+        n_context = 0
+        for is_context, entry in _part(recording, begin_ns, end_ns, faults):
+            writer.put(*entry)
+            n_context += is_context
+        if not writer.counts:
+            length_s = (last_ns - start_ns) / 1e9
+            raise ConfigError(f"{recording} has no message after {from_s:g} s; it is {length_s:.1f} s long")
+    return writer.counts.total() - n_context
+
+
+def _part(
+    recording: Path, begin_ns: int, end_ns: int, faults: Counter[str]
+) -> Iterator[tuple[bool, tuple[str, bytes, int]]]:
+    """Messages that arrived in a part, each with whether it is older and holds in the part, if there are any."""
     context: dict[str, bytes] = {}
-    n_written = 0
-    with RecordingWriter(out, overwrite=overwrite) as writer:
-        for key, data, t_ns in read_messages(recording, faults):
-            if t_ns < begin_ns and key.endswith(CONTEXT):
-                context[key] = data
-            if not begin_ns <= t_ns <= end_ns:
-                continue
-            if not n_written:
-                for earlier, held in context.items():
-                    writer.put(earlier, held, begin_ns)
-            writer.put(key, data, t_ns)
-            n_written += 1
-    if not n_written:
-        out.unlink()
-        raise ConfigError(f"{recording} has no message after {from_s:g} s; it is {length_s:.1f} s long")
-    return n_written
+    for key, data, t_ns in read_messages(recording, faults):
+        if t_ns < begin_ns and key.endswith(CONTEXT):
+            context[key] = data
+        if begin_ns <= t_ns <= end_ns:
+            for earlier, held in context.items():
+                yield True, (earlier, held, begin_ns)
+            context = {}
+            yield False, (key, data, t_ns)

@@ -17,6 +17,7 @@ from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.recording_reader import MAGIC, RecordingReader
 from calib.rig.recording_repair import repair_recording
 from camera_node.foundation.errors import ConfigError
+from fusion.recordings.recording_files import trim_recording
 from tests.conftest import ROOT
 from tests.processes import run_program
 
@@ -234,3 +235,19 @@ def test_a_recording_that_is_larger_than_the_memory_is_repaired(tmp_path: Path):
     found, grown_kb = map(int, done.stdout.split())
     assert n - 20 < found < n
     assert grown_kb < 20_000
+
+
+def test_an_empty_part_replaces_no_recording(tmp_path: Path):
+    source, out = tmp_path / "source.mcap", tmp_path / "part.mcap"
+    entries = write(source, 12)
+    with pytest.raises(ConfigError, match=r"no message after 100 s; it is 11\.0 s long"):
+        trim_recording(source, out, 100.0, 200.0)
+    assert not out.exists()
+    assert trim_recording(source, out, 3.0, 5.0) == 3
+    assert read(out)[0] == entries[3:6]
+    with pytest.raises(ConfigError, match="exists; give another name, or --force"):
+        trim_recording(source, out, 0.0, 1.0)
+    with pytest.raises(ConfigError, match="no message after"):
+        trim_recording(source, out, 100.0, 200.0, overwrite=True)
+    assert read(out)[0] == entries[3:6]
+    assert sorted(tmp_path.iterdir()) == [out, source]
