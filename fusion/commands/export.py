@@ -2,12 +2,13 @@
 """`roundel export`: a recording in the formats of other programs."""
 
 from pathlib import Path
-from typing import Literal
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from fusion.export.points import sample_points
 from fusion.export.pose_formats import (
+    FORMATS,
+    Format,
     write_c3d,
     write_csv,
     write_foxglove,
@@ -19,17 +20,6 @@ from fusion.export.pose_formats import (
 )
 from fusion.export.recorded_poses import RecordedPoses
 
-Format = Literal["c3d", "trc", "csv", "tum", "parquet", "rerun", "rosbag", "foxglove"]
-FORMATS: dict[str, Format] = {
-    ".c3d": "c3d",
-    ".trc": "trc",
-    ".csv": "csv",
-    ".tum": "tum",
-    ".parquet": "parquet",
-    ".rrd": "rerun",
-    "": "rosbag",
-    ".mcap": "foxglove",
-}
 WRITERS = {
     "csv": write_csv,
     "parquet": write_parquet,

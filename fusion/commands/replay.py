@@ -5,7 +5,7 @@ from pathlib import Path
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say, track
-from fusion.export.pose_formats import require_suffix, write_csv
+from fusion.export.pose_formats import require_own_format, write_csv
 from fusion.model.limits import Limits
 from fusion.recordings.arena_recording import read_recording
 from fusion.recordings.offline_fusion import (
@@ -40,7 +40,7 @@ def replay(
         rate_hz: poses a second; without it the rate of the fastest camera.
         smooth: estimate each pose from later frames, too, not only from those before it.
     """
-    require_suffix(out, ".csv", ".mcap")
+    require_own_format(out, ".csv", ".mcap")
     if out.exists() and recording.exists() and out.samefile(recording):
         raise ConfigError(f"--out {out} is the recording itself; give another file, which is then replaced")
     recorded = read_recording(recording)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from calib.rig.rig import load_rig
 from camera_node.foundation.terminal import say, track
-from fusion.export.pose_formats import require_suffix, write_csv
+from fusion.export.pose_formats import require_own_format, write_csv
 from fusion.model.robots import load_robots
 from fusion.recordings.offline_fusion import OfflineArena, Summary, fuse_recording, read_detections
 
@@ -31,7 +31,7 @@ def run(
         rate_hz: poses a second; without it the rate of the fastest camera.
         smooth: estimate each pose from later frames, too, not only from those before it.
     """
-    require_suffix(out, ".csv")
+    require_own_format(out, ".csv")
     cameras = load_rig(rig).require_placed(rig)
     arena = OfflineArena(cameras, load_robots(robots), rate_hz, smooth=smooth)
     messages, summary = read_detections(frames, observations, cameras), Summary()

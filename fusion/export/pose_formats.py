@@ -8,7 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import numpy as np
 
@@ -24,6 +24,17 @@ from fusion.export.points import PointTrajectories
 from fusion.export.recorded_poses import RecordedPoses
 from fusion.protocol.pose_messages import RobotPose
 
+Format = Literal["c3d", "trc", "csv", "tum", "parquet", "rerun", "rosbag", "foxglove"]
+FORMATS: dict[str, Format] = {  # of `roundel export`, by suffix
+    ".c3d": "c3d",
+    ".trc": "trc",
+    ".csv": "csv",
+    ".tum": "tum",
+    ".parquet": "parquet",
+    ".rrd": "rerun",
+    "": "rosbag",
+    ".mcap": "foxglove",
+}
 MAX_FRAMES = 65535  # of a C3D file, whose counter has 16 bits
 MM = 1000.0
 TRAIL_M = 0.004  # radius of a drawn trail
@@ -57,15 +68,11 @@ def _hidden_path(path: Path) -> Iterator[Path]:
         _remove(part)
 
 
-def require_suffix(path: Path, *suffixes: str) -> None:
-    """Raise ConfigError for the name of a file that does not end in one of the suffixes."""
-    if path.suffix.lower() not in suffixes:
-        names = " or ".join(suffixes)
-        raise ConfigError(
-            f"--out {path} does not end in {names}; write {path.stem}.mcap, which roundel export converts"
-            if ".mcap" in suffixes
-            else f"--out {path} does not end in {names}"
-        )
+def require_own_format(path: Path, *own: str) -> None:
+    """Raise ConfigError for a result whose suffix is of another format of `roundel export` than those in `own`."""
+    if path.suffix and FORMATS.get(path.suffix.lower(), "csv") not in {FORMATS[suffix] for suffix in own}:
+        converted = f"; write {path.stem}.mcap, which roundel export converts" if ".mcap" in own else ""
+        raise ConfigError(f"--out {path} does not end in {' or '.join(own)}{converted}")
 
 
 def write_csv(poses: Iterable[RobotPose], path: Path) -> None:
