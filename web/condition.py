@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.rig.rig import Rig
 from camera_node.protocol.presence import NO_SERVER, no_such_arena
+from fusion.protocol.arena_health import describe_contradiction
 from fusion.protocol.pose_messages import FusionStatus
 from web.state.feed import ArenaState
 from web.tables import STALE_S, camera_silence_s, describe_silence, tabulate_cameras, tabulate_robots
@@ -36,7 +37,12 @@ def assess(state: ArenaState, endpoint: str, calibrating: str = "") -> Condition
     """
     if is_relative(state):
         return _relative_condition(state)
-    faults = [*_server_faults(state, endpoint), *_camera_faults(state, calibrating), *_robot_faults(state)]
+    faults = [
+        *_server_faults(state, endpoint),
+        *_contradictions(state),
+        *_camera_faults(state, calibrating),
+        *_robot_faults(state),
+    ]
     for level in ("wait", "bad", "warn"):
         found = [fault for fault in faults if fault.level == level]
         if found:
@@ -91,6 +97,13 @@ def _server_faults(state: ArenaState, endpoint: str) -> Iterator[Condition]:
         yield Condition("bad", f"no server at {endpoint}: {cause}")
     else:
         yield Condition("bad", f"the server is silent for {age_s:.0f} s: check that it runs at {endpoint}")
+
+
+def _contradictions(state: ArenaState) -> Iterator[Condition]:
+    """Cameras and robots whose residuals contradict the claimed uncertainty: poses are wrong by more than they say."""
+    if state.status is not None and state.age_s(state.status) <= STALE_S:
+        for contradiction in state.status.message.contradictions:
+            yield Condition("warn", describe_contradiction(contradiction))
 
 
 def _camera_faults(state: ArenaState, calibrating: str) -> Iterator[Condition]:

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from camera_node.protocol.server_connection import ServerConnection
-from fusion.protocol.pose_messages import FusionStatus
+from fusion.protocol.pose_messages import Contradiction, FusionStatus
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.colours import own_colours, robot_colour
@@ -55,6 +55,20 @@ def test_a_silent_camera_is_red_and_comes_first(healthy: ArenaState):
     condition = assess(with_silent(healthy, "north", 4.2), ENDPOINT)
     assert condition.level == "bad"
     assert condition.text == "camera north silent for 4 s: check its cable and its program (and 1 more)"
+
+
+def test_a_camera_that_contradicts_the_others_is_named_with_millimetres(healthy: ArenaState):
+    """Before the advice of its node, which a moved camera may have, too: poses are wrong, and do not say so."""
+    assert healthy.status is not None
+    moved = Contradiction(kind="camera", names=("east",), size_mm=4.2, error_over_claim=9.0)
+    status = msgspec.structs.replace(healthy.status.message, contradictions=(moved,))
+    healthy.status = TimedMessage(status, healthy.now_s)
+    node = msgspec.structs.replace(healthy.cameras["north"].message, advice="too dark")
+    healthy.cameras["north"] = TimedMessage(node, healthy.now_s)
+    condition = assess(healthy, ENDPOINT)
+    assert condition.level == "warn"
+    assert condition.text.startswith("camera east contradicts the other cameras by 4.2 mm")
+    assert condition.text.endswith("calibrate it again (and 1 more)")
 
 
 def test_a_camera_that_the_server_does_not_list_is_not_silent(healthy: ArenaState):
