@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The tab Robots in a real browser with a real server: rename, turn, save and delete a robot by clicks."""
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -77,4 +78,29 @@ def test_a_robot_is_changed_by_clicks(arena: tuple[Client, View], tmp_path: Path
         page.get_by_role("button", name="Delete", exact=True).click()
         page.get_by_role("button", name="Delete: click again").click()
         page.get_by_text("cart is deleted").wait_for()
-    wait_for(lambda: client.declared_robots().robots == {})
+        wait_for(lambda: client.declared_robots().robots == {})
+
+
+def test_changes_are_undone_where_they_were_made(arena: tuple[Client, View]):
+    """The latest first; a robot that another program changed since is left as it is."""
+    client, view = arena
+    with browsing(view) as page:
+        open_editor(page)
+        undo = page.get_by_role("button", name="Undo the change of a robot")
+        page.get_by_role("button", name="Turn the heading").click()
+        page.get_by_text("turned by 90 degrees").wait_for()
+        page.get_by_role("button", name="Delete", exact=True).click()
+        page.get_by_role("button", name="Delete: click again").click()
+        page.get_by_text("a is deleted").wait_for()
+        undo.click()
+        page.get_by_text("undone: a is deleted").wait_for()
+        assert client.declared_robots().robots == {"a": turn_heading(TRIANGLE, 90.0)}
+        undo.click()
+        page.get_by_text("undone: the x axis of a turned").wait_for()
+        assert client.declared_robots().robots == {"a": TRIANGLE}
+        page.get_by_role("button", name="Turn the heading").click()
+        page.get_by_text(re.compile("^the x axis of a turned by 90 degrees")).wait_for()
+        client.change_robots(define={"a": TRIANGLE}, replace=True)
+        undo.click()
+        page.get_by_text("was changed since by another program or page").wait_for()
+        assert client.declared_robots().robots == {"a": TRIANGLE}

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The tab Robots: all declared robots with their state, why a robot is not tracked, and changes of one robot."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import viser
 
 from camera_node.foundation.config import require_name
 from fusion.errors import FusionError
-from fusion.model.robots import move_origin, save_robots, turn_heading
+from fusion.model.robots import Robot, move_origin, save_robots, turn_heading
 from fusion.protocol.pose_messages import Robots, RobotsRequest
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
@@ -37,8 +38,24 @@ def _numbered(path: Path) -> Iterator[Path]:
     yield from (path.with_stem(f"{path.stem}-{k}") for k in count(1))
 
 
+@dataclass(frozen=True)
+class RobotChange:
+    """A change that this page made, and how to undo it.
+
+    Attributes:
+        about: the change in words.
+        undo: the request that reverts it.
+        name, after: the robot that it left, None if it deleted the robot.
+    """
+
+    about: str
+    undo: RobotsRequest
+    name: str
+    after: Robot | None
+
+
 class RobotEditor:
-    """Renames, deletes and saves robots, and changes their frames.
+    """Renames, deletes and saves robots, and changes their frames; undoes these changes, the latest first.
 
     Args:
         gui: where the controls are added.
@@ -49,6 +66,7 @@ class RobotEditor:
     def __init__(self, gui: viser.GuiApi, subscription: Subscription, folder: Path) -> None:
         self._subscription, self._file = subscription, folder / "robots.yaml"
         self._confirmed = ""  # robot whose deletion the next click confirms
+        self._changes: list[RobotChange] = []
         with gui.add_folder("One robot", expand_by_default=False):
             self._robot = gui.add_dropdown("Robot", [NO_ROBOT])
             self._name = gui.add_text("New name", "")
@@ -66,6 +84,7 @@ class RobotEditor:
                 ActionButton(gui, "Turn the heading", self.turn, answer, "the robot is acquired again"),
                 ActionButton(gui, "Save all robots", self.save, answer, f"writes {self._file}"),
             )
+            self._undo = ActionButton(gui, "Undo the change of a robot", self.undo, answer)
 
     def update(self, state: ArenaState) -> None:
         """Offer the declared robots."""
@@ -77,13 +96,14 @@ class RobotEditor:
         self._delete.show(enabled=bool(names), label=CONFIRM if self._confirmed else "Delete")
         for button in self._others:
             button.show(enabled=bool(names))
+        self._undo.show(enabled=bool(self._changes))
 
     def rename(self) -> str:
         """Rename the robot; it stays tracked."""
         old, new = str(self._robot.value), require_name(self._name.value, "a robot")
         robots = self._subscription.change_robots(RobotsRequest(rename={old: new}))
         self._name.value = ""
-        return self._describe(robots, f"{old} is {new} now")
+        return self._note(robots, f"{old} is {new} now", RobotsRequest(rename={new: old}), new)
 
     def delete(self) -> str:
         """Remove the robot, with the second click."""
@@ -92,22 +112,32 @@ class RobotEditor:
             self._confirmed = name
             return f"click again to delete {name}"
         self._confirmed = ""
-        return self._describe(
-            self._subscription.change_robots(RobotsRequest(remove=(name,))), f"{name} is deleted"
-        )
+        before = self._present(name)
+        robots = self._subscription.change_robots(RobotsRequest(remove=(name,)))
+        return self._note(robots, f"{name} is deleted", RobotsRequest(define={name: before}), name)
 
     def move_pivot(self) -> str:
         """Move the robot's origin."""
         name, (x, y, z) = str(self._robot.value), self._pivot.value
-        robots = self._subscription.reframe_robot(name, lambda robot: move_origin(robot, (x, y, z)))
+        about = f"the origin of {name} moved by {x:g}, {y:g}, {z:g} m"
+        outcome = self._reframe(name, lambda robot: move_origin(robot, (x, y, z)), about)
         self._pivot.value = (0.0, 0.0, 0.0)
-        return self._describe(robots, f"the origin of {name} moved by {x:g}, {y:g}, {z:g} m")
+        return outcome
 
     def turn(self) -> str:
         """Turn the robot's x axis."""
         name, degrees = str(self._robot.value), float(self._degrees.value)
-        robots = self._subscription.reframe_robot(name, lambda robot: turn_heading(robot, degrees))
-        return self._describe(robots, f"the x axis of {name} turned by {degrees:g} degrees")
+        about = f"the x axis of {name} turned by {degrees:g} degrees"
+        return self._reframe(name, lambda robot: turn_heading(robot, degrees), about)
+
+    def undo(self) -> str:
+        """Revert the latest change of this page that is not undone yet, unless its robot was changed since."""
+        change = self._changes.pop()
+        if self._subscription.declared_robots().robots.get(change.name) != change.after:
+            raise FusionError(
+                f"{change.name} was changed since by another program or page; it is left as it is"
+            )
+        return self._describe(self._subscription.change_robots(change.undo), f"undone: {change.about}")
 
     def save(self) -> str:
         """Write all robots to robots.yaml; an existing file gets the next free number."""
@@ -117,6 +147,21 @@ class RobotEditor:
         path = next(path for path in _numbered(self._file) if not path.exists())
         save_robots(robots, path)
         return f"wrote {len(robots)} robots to {path}"
+
+    def _present(self, name: str) -> Robot:
+        robots = self._subscription.declared_robots().robots
+        if name not in robots:
+            raise FusionError(f"there is no robot '{name}' any more; choose another one")
+        return robots[name]
+
+    def _reframe(self, name: str, change: Callable[[Robot], Robot], about: str) -> str:
+        before = self._present(name)
+        robots = self._subscription.reframe_robot(name, change)
+        return self._note(robots, about, RobotsRequest(define={name: before}, replace=True), name)
+
+    def _note(self, robots: Robots, about: str, undo: RobotsRequest, name: str) -> str:
+        self._changes.append(RobotChange(about, undo, name, robots.robots.get(name)))
+        return self._describe(robots, about)
 
     def _describe(self, robots: Robots, change: str) -> str:
         unsaved = "; not saved on the server: use Save all robots" if robots.unsaved else ""
