@@ -165,7 +165,8 @@ def _explain_motion(
     return len(fitting), (
         f"at {at_s:.1f} s of the recording it moved by {apart:.3f} of the rig's units and turned by {turned:.1f} "
         f"degrees: this pose explains {len(fitting)} of the {len(rows)} detections that contradict the rig. Calibrate "
-        "the parts of the recording before and after that on their own, or leave the camera out"
+        "the parts of the recording before and after that on their own, or leave the camera out. Did nothing move? A "
+        "wand that is seen from its other side from then on needs thickness_m in its file"
     )
 
 

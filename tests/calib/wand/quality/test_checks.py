@@ -10,6 +10,8 @@ from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
 from tests.calib.synthetic import WAND, Arena, record, ring
 
+STICK_WITH_ROUNDELS = msgspec.structs.replace(WAND, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
+
 
 def test_a_wand_at_rest_is_refused():
     arena = Arena(ring(3).truth, speed=0.0)
@@ -30,3 +32,17 @@ def test_a_wand_file_with_a_wrong_spacing_is_refused():
     far_off = msgspec.structs.replace(WAND, markers=((0.0, 0.0, 0.0), (0.14, 0.0, 0.0), (0.5, 0.0, 0.0)))
     with pytest.raises(CalibrationError, match=r"'cam\d' and 'cam\d' .* \d+ times.* measure the wand"):
         calibrate(arena.intrinsics, far_off, messages)
+
+
+@pytest.mark.parametrize("sigma_px", [0.1, 0.4])
+def test_a_length_of_4_percent_too_much_is_refused_by_the_sizes(sigma_px: float):
+    """0.52 m for 0.50: two markers have no ratio, but their sizes have. The stated diameter reconciles both, and the
+    true length too."""
+    arena = ring(3, wand=STICK_WITH_ROUNDELS)
+    messages = record(arena, 8.0, sigma_px=sigma_px, numbered=True)
+    longer = msgspec.structs.replace(STICK_WITH_ROUNDELS, markers=((0.0, 0.0, 0.0), (0.52, 0.0, 0.0)))
+    with pytest.raises(CalibrationError, match=r"sizes disagree by 4%: .* is 0\.12[45]\d m across") as caught:
+        calibrate(arena.intrinsics, longer, messages)
+    across = float(re.findall(r"is (0\.\d+) m across", str(caught.value))[0])
+    assert calibrate(arena.intrinsics, msgspec.structs.replace(longer, diameter_m=across), messages).names
+    assert len(calibrate(arena.intrinsics, STICK_WITH_ROUNDELS, messages).names) == 3
