@@ -39,6 +39,7 @@ constexpr double kBlackInk = 0.7;  // share of the paper's level below which ink
 constexpr double kHidden = 0.3;
 constexpr int kMinHidden = 3;
 constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of uneven light may leave
+constexpr double kLarge = 160;         // pixels: bends of 5 % are fitted up to this size
 constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
@@ -225,10 +226,9 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
     return has_elliptic_edges(misfit, fit, context.noise) ? std::nullopt : std::optional(Refusal::kEdges);
 }
 
-std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
-                                      const AcceptanceContext& context, bool known) {
-    guess.camera = context.camera.prior_at(guess.outer.x, guess.outer.y);
-    guess.fields = AllowedFields::kBend;
+/// Fits a roundel to the image as it is, or smoothed.
+static std::optional<RoundelFit> fit_at_full_size(const ImageView& image, const InitialGuess& guess,
+                                                  const AcceptanceContext& context, bool known) {
     const auto fits = fit_on_ground(image, guess);
     if (!fits) return std::nullopt;
     const RoundelFit* const first = &fits->even;
@@ -258,6 +258,26 @@ std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess
     if (rest && is_within_limits(*rest, context.limits)) return rest;
     if (accepted) return fit;
     return elliptic && may_be_ragged(fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;
+}
+
+/// Fits a roundel with what is known of its camera; a large one that is refused at half the size.
+static std::optional<RoundelFit> fit_at_any_size(const ImageView& image, const InitialGuess& guess,
+                                                 const AcceptanceContext& context, bool known) {
+    const auto fit = fit_at_full_size(image, guess, context, known);
+    if (fit || guess.model || guess.outer.major < kLarge) return fit;
+    const Halved halved(image, guess);
+    const AcceptanceContext half{context.limits, context.camera, context.noise / 2, context.knows_camera};
+    const auto rest = fit_at_any_size(halved.view(), halved.half_guess, half, known);
+    if (!rest) return std::nullopt;
+    const RoundelFit whole = halved.in_image(*rest);
+    return is_within_limits(whole, context.limits) ? std::optional(whole) : std::nullopt;
+}
+
+std::optional<RoundelFit> fit_roundel(const ImageView& image, InitialGuess guess,
+                                      const AcceptanceContext& context, bool known) {
+    guess.camera = context.camera.prior_at(guess.outer.x, guess.outer.y);
+    guess.fields = AllowedFields::kBend;
+    return fit_at_any_size(image, guess, context, known);
 }
 
 }  // namespace roundel

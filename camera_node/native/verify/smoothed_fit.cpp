@@ -9,7 +9,8 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMargin = 4;  // pixels: the band of the fit, the card and the reach of the mean
+constexpr double kMargin = 4;       // pixels: the band of the fit, the card and the reach of the mean
+constexpr double kCardReach = 0.8;  // outer diameters: to the edge of a card, and the band of the fit
 constexpr double kInflation = (16.0 / 6) * (16.0 / 6);  // noise variance over that of the binomial mean
 
 /// The 3 x 3 binomial mean; the pixels on the image's border are repeated.
@@ -29,13 +30,53 @@ std::vector<uint8_t> binomial_mean(const ImageView& image) {
     return mean;
 }
 
+/// The part of an image within `reach` of a guess.
+struct Surroundings {
+    Surroundings(const ImageView& image, const InitialGuess& guess, double reach)
+        : left(std::max(0, int(guess.outer.x - reach))),
+          top(std::max(0, int(guess.outer.y - reach))),
+          width(std::min(image.width, int(guess.outer.x + reach) + 1) - left),
+          height(std::min(image.height, int(guess.outer.y + reach) + 1) - top) {}
+    int left, top, width, height;
+};
+
+/// A place in a picture of half the size, in the pixels of the one that it was made of.
+double doubled(double place, int from) { return from + 2 * place + 0.5; }
+
 }  // namespace
 
+Halved::Halved(const ImageView& image, const InitialGuess& guess) : half_guess(guess) {
+    const Surroundings part(image, guess, kCardReach * guess.outer.major);
+    left_ = part.left;
+    top_ = part.top;
+    width_ = std::max(0, part.width / 2);
+    height_ = std::max(0, part.height / 2);
+    for (int y = 0; y < height_; ++y) {
+        const uint8_t *a = image.row(top_ + 2 * y) + left_, *b = image.row(top_ + 2 * y + 1) + left_;
+        for (int x = 0; x < 2 * width_; x += 2)
+            levels_.push_back(uint8_t((a[x] + a[x + 1] + b[x] + b[x + 1] + 2) / 4));
+    }
+    Ellipse& outer = half_guess.outer;
+    outer = {(outer.x - left_ - 0.5) / 2, (outer.y - top_ - 0.5) / 2, outer.major / 2, outer.minor / 2,
+             outer.angle};
+    LightGradient& light = half_guess.camera.light;
+    light = {2 * light.x, 2 * light.y, 2 * light.sigma};
+}
+
+RoundelFit Halved::in_image(RoundelFit fit) const {
+    for (double* length :
+         {&fit.outer.major, &fit.outer.minor, &fit.offset_x, &fit.offset_y, &fit.blur, &fit.p[kAxx],
+          &fit.p[kAxy], &fit.p[kAyy], &fit.p[kBlur], &fit.fields.frame.major, &fit.fields.frame.minor})
+        *length *= 2;
+    for (double* x : {&fit.outer.x, &fit.p[kX], &fit.fields.frame.x}) *x = doubled(*x, left_);
+    for (double* y : {&fit.outer.y, &fit.p[kY], &fit.fields.frame.y}) *y = doubled(*y, top_);
+    fit.pose_cov = scaled(fit.pose_cov, 4);
+    fit.shading = {fit.shading.x / 2, fit.shading.y / 2, fit.shading.variance / 4};
+    return fit;
+}
+
 std::optional<RoundelFit> fit_smoothed(const ImageView& image, const InitialGuess& guess) {
-    const double reach = guess.outer.major / 2 + kMargin;
-    const int left = std::max(0, int(guess.outer.x - reach)), top = std::max(0, int(guess.outer.y - reach));
-    const int width = std::min(image.width, int(guess.outer.x + reach) + 1) - left;
-    const int height = std::min(image.height, int(guess.outer.y + reach) + 1) - top;
+    const auto [left, top, width, height] = Surroundings(image, guess, guess.outer.major / 2 + kMargin);
     if (width < 3 || height < 3) return std::nullopt;
     const std::vector<uint8_t> smooth = binomial_mean(image.window(left, top, width, height));
     InitialGuess moved = guess;

@@ -1,5 +1,9 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <cstdint>
+#include <optional>
+#include <vector>
+
 #include "fit/photometric_fit.hpp"
 
 namespace roundel {
@@ -9,5 +13,20 @@ namespace roundel {
 ///
 /// Smoothing reduces the noise and correlates adjacent pixels; the covariance is inflated by (16/6)^2.
 std::optional<RoundelFit> fit_smoothed(const ImageView& image, const InitialGuess& guess);
+
+/// The surroundings of a guess at half the size. Paper is never flat and edges that were cut by hand are
+/// uneven in proportion to the size, so a large roundel is judged as one of half the size is.
+class Halved {
+  public:
+    Halved(const ImageView& image, const InitialGuess& guess);
+    ImageView view() const { return {levels_.data(), width_, height_, width_}; }
+    /// A fit to `view`, as one to the image.
+    RoundelFit in_image(RoundelFit fit) const;
+    InitialGuess half_guess;  // in `view`
+
+  private:
+    int left_, top_, width_, height_;
+    std::vector<uint8_t> levels_;
+};
 
 }  // namespace roundel
