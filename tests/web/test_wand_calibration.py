@@ -85,6 +85,7 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
         wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
         assert "wave where" in panel.next_action()
         page.get_by_role("button", name="End wand session").click()
+        wait_for(lambda: "wait for its calibration" in panel.next_action())
         page.get_by_text("accept or discard").wait_for(timeout=CALIBRATION_MS)
         assert not load_rig(files.rig).placed(), "nothing changes before the user accepts"
         wait_for(lambda: "decide" in panel.next_action())

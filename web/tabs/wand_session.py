@@ -72,6 +72,8 @@ class WandSessionPanel:
 
     def next_action(self) -> str:
         """What the operator should do in the session, or with its result; empty if there is none."""
+        if self._session.is_running and self._session.handle.disabled:
+            return "the wand session has ended: wait for its calibration"
         if self._session.is_running:
             return "a wand session runs: wave where the table in Calibrate says"
         return "a new calibration is ready: decide in Calibrate whether to use it" if self._candidate else ""
