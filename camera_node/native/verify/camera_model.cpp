@@ -173,7 +173,7 @@ bool CameraModel::contradicts(const std::vector<Observation>& roundels) {
         if (track < 0 || fit->outer.major < kMinDiameter || fit->clipped) continue;
         const SeenRatio now{track, fit->ratio, square(fit->ratio_sigma) + square(Print::kPaper)};
         const auto last = std::find_if(last_.begin(), last_.end(),
-                                       [&](const SeenRatio& ratio) { return ratio.track == track; });
+                                       [number = track](const SeenRatio& ratio) { return ratio.track == number; });
         if (last != last_.end())
             scores.push_back(square(now.ratio - last->ratio) / (now.variance + last->variance));
         seen.push_back(now);
