@@ -172,8 +172,9 @@ bool CameraModel::contradicts(const std::vector<Observation>& roundels) {
     for (const auto& [fit, track] : roundels) {
         if (track < 0 || fit->outer.major < kMinDiameter || fit->clipped) continue;
         const SeenRatio now{track, fit->ratio, square(fit->ratio_sigma) + square(Print::kPaper)};
-        const auto last = std::find_if(last_.begin(), last_.end(),
-                                       [number = track](const SeenRatio& ratio) { return ratio.track == number; });
+        const auto last = std::find_if(last_.begin(), last_.end(), [number = track](const SeenRatio& ratio) {
+            return ratio.track == number;
+        });
         if (last != last_.end())
             scores.push_back(square(now.ratio - last->ratio) / (now.variance + last->variance));
         seen.push_back(now);
