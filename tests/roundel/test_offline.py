@@ -91,7 +91,7 @@ def test_a_lens_from_images_and_from_files(tmp_path: Path):
     blank = [np.zeros_like(images[0])] * 3
     by_images = calibrate_intrinsics({"north": images, "south": blank}, SPEC)
     assert by_images.rig["north"] == by_files.rig["north"]
-    assert "0 of 3 frames" in by_images.faults["south"]
+    assert "the board is in no image" in by_images.faults["south"]
     camera = by_files.rig["north"]
     assert abs(camera.fx - LENS.fx) < 0.005 * LENS.fx
     assert by_files.lenses["north"].rms_px < 0.3
@@ -99,7 +99,7 @@ def test_a_lens_from_images_and_from_files(tmp_path: Path):
     merged = calibrate_intrinsics({"north": images}, SPEC, rig=placed).rig
     assert merged["north"].T_world_cam is None
     assert merged["east"] == placed["east"]
-    with pytest.raises(RoundelError, match="0 of 3 frames"):
+    with pytest.raises(RoundelError, match="the board is in no image"):
         calibrate_intrinsics({"south": blank}, SPEC)
 
 

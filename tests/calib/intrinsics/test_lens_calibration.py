@@ -171,7 +171,7 @@ def test_too_few_parallel_or_mixed_views_are_refused():
     finder = CharucoFinder(make_charuco_board(SPEC))
     with pytest.raises(CalibrationError, match="parallel views can't fix a lens; tilt"):
         calibrate_lens("cam0", name_all([render(*pose) for pose in board_poses(0.0, 8)]), finder)
-    with pytest.raises(CalibrationError, match="in 0 of 9 frames"):
+    with pytest.raises(CalibrationError, match="the board is in no image"):
         calibrate_lens("cam0", name_all([np.zeros((48, 64), np.uint8)] * 9), finder)
     with pytest.raises(CalibrationError, match=r"1\.png: 64 x 49, before: 64 x 48"):
         calibrate_lens("cam0", name_all([np.zeros((48, 64), np.uint8), np.zeros((49, 64), np.uint8)]), finder)
