@@ -70,10 +70,10 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
         """The offset, the drift and the reference of the stamps."""
         return self.time_offset_ms, self.time_drift_ppm, self.time_reference_ns
 
-    def capture_ns(self, t_ns: int, clock_error_us: float = 0.0) -> int:
-        """The true capture time of a stamp, ns. A clock that states a bound of its error is kept by a server, so the
-        drift of a recording does not hold for it."""
-        since_ns = 0 if clock_error_us > 0 else t_ns - self.time_reference_ns
+    def capture_ns(self, t_ns: int, sent_ns: int = 0) -> int:
+        """The true capture time of a stamp, ns. A camera node, which states when it sent the message (`sent_ns`), has
+        the server's time: the drift of a recording does not hold for it."""
+        since_ns = 0 if sent_ns else t_ns - self.time_reference_ns
         return t_ns + round(1e6 * self.time_offset_ms + 1e-6 * self.time_drift_ppm * since_ns)
 
     def readout_s(self, stated_us: float) -> float:

@@ -207,7 +207,7 @@ def as_they_arrived(
 ) -> list[tuple[int, Detections]]:
     """Time of arrival (ns) and message in order, as if each arrived at its true capture time."""
     arrivals = [
-        (cameras[m.camera].capture_ns(m.t_ns, m.clock_error_us) if m.camera in cameras else m.t_ns, m)
+        (cameras[m.camera].capture_ns(m.t_ns, m.sent_ns) if m.camera in cameras else m.t_ns, m)
         for m in messages
     ]
     return sorted(arrivals, key=lambda arrival: arrival[0])

@@ -194,8 +194,8 @@ def _calibrate(rig: Rig, wand: Body, given: _Recorded, distance: Distance | None
     placement = replace(placement, unplaced=placement.unplaced | absent, timing=timing)
     jump = find_jump(placement.recording.names, solution.adjusted, solution.observations)
     result = conclude(rig, solution, placement, jump)
-    if solution.adjusted.problem.drift_sigma < SLEWED_DRIFT or all(m.clock_error_us > 0 for m in messages):
-        return result  # no drift, or that of clocks which a server keeps
+    if solution.adjusted.problem.drift_sigma < SLEWED_DRIFT or any(m.sent_ns for m in messages):
+        return result  # no drift, or camera nodes, whose clocks a server keeps
     return with_aligned_clocks(
         result, Alignment(start_ns + round(1e9 * recording.middle_s), {}), -recording.middle_s
     )

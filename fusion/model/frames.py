@@ -49,7 +49,7 @@ class CalibratedFrame:
         """The frame of a message from a calibrated camera."""
         return cls.measure(
             message.camera,
-            camera.capture_ns(message.t_ns, message.clock_error_us),
+            camera.capture_ns(message.t_ns, message.sent_ns),
             message.unpack(),
             camera,
             stamp_ns=message.t_ns,
@@ -71,9 +71,9 @@ class CalibratedFrame:
     def recalibrated(self, old: Camera, new: Camera) -> "CalibratedFrame":
         """The frame by another calibration of its camera."""
         stamp_ns = self.stamp_ns or self.t_ns
-        shift_ns = new.capture_ns(stamp_ns) - old.capture_ns(stamp_ns)
+        before_ns, after_ns = (camera.capture_ns(stamp_ns, self.sent_ns) for camera in (old, new))
         xy, scale = undistort(new, self.roundels)
-        return replace(self, t_ns=self.t_ns + shift_ns, xy=xy, scale=scale)
+        return replace(self, t_ns=self.t_ns + after_ns - before_ns, xy=xy, scale=scale)
 
     def delays(self, lens: Lens) -> Array:
         """(N,) times from `t_ns` to the capture of each roundel's row, seconds."""

@@ -147,4 +147,4 @@ def test_a_drift_of_a_recording_does_not_hold_for_a_running_camera():
         light().truth.cameras["cam00"], time_offset_ms=2.0, time_drift_ppm=1e4, time_reference_ns=10**9
     )
     assert camera.capture_ns(3 * 10**9) == 3 * 10**9 + 2_000_000 + 20_000_000
-    assert camera.capture_ns(3 * 10**9, clock_error_us=200.0) == 3 * 10**9 + 2_000_000
+    assert camera.capture_ns(3 * 10**9, sent_ns=1) == 3 * 10**9 + 2_000_000
