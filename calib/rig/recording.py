@@ -36,6 +36,7 @@ class RecordingWriter:
     Args:
         path: the MCAP file.
         overwrite: replace an existing file.
+        appears_at: where the file is moved if it is whole: errors name that, and a full disk completes nothing.
 
     Raises, at entry:
         ConfigError: the file exists or can't be written.
@@ -43,8 +44,8 @@ class RecordingWriter:
         ConfigError: the disk is full.
     """
 
-    def __init__(self, path: Path, overwrite: bool = True) -> None:
-        self.path = path
+    def __init__(self, path: Path, overwrite: bool = True, appears_at: Path | None = None) -> None:
+        self.path, self._appears_at = path, appears_at
         self.counts: Counter[str] = Counter()
         self._mode = "wb" if overwrite else "xb"
         self._channels: dict[str, int] = {}
@@ -56,7 +57,7 @@ class RecordingWriter:
         except FileExistsError:
             raise ConfigError(f"{self.path} exists; give another name, or --force to replace it") from None
         except OSError as error:
-            raise unwritable(self.path, error) from None
+            raise unwritable(self._appears_at or self.path, error) from None
         # An index of each channel in each chunk would take up to 0.1 kB of memory for each of them until the end.
         self._writer = Writer(self._file, chunk_size=MAX_CHUNK, index_types=IndexType.CHUNK)
         self._writer.start(profile=PROFILE, library="roundel")
@@ -100,6 +101,8 @@ class RecordingWriter:
         """Close a file that can't grow, with an index in place of its last chunks; the error to raise."""
         size = os.fstat(self._file.fileno()).st_size
         self._file.raw.close()  # without the buffered bytes, for which there is no space
+        if self._appears_at is not None:
+            return unwritable(self._appears_at, error)
         try:
             n = repair_recording(self.path, size).n_messages
             state = f"the recording is closed with {n} messages; free space on the disk"
@@ -150,7 +153,7 @@ def new_recording(path: Path, overwrite: bool = True) -> Iterator[RecordingWrite
         raise ConfigError(f"{path} exists; give another name, or --force to replace it")
     part = path.with_name(f".{path.name}.part")
     try:
-        with RecordingWriter(part) as writer:
+        with RecordingWriter(part, appears_at=path) as writer:
             yield writer
         os.replace(part, path)
     except OSError as error:

@@ -156,6 +156,21 @@ def test_a_full_disk_ends_the_recording_in_one_line(tmp_path):
     assert f"{len(indexed(path))} messages" in lines[0]
 
 
+def test_a_result_on_a_full_disk_replaces_no_file(tmp_path):
+    """What must appear whole is not completed: the error names the result, and nothing is left of it."""
+    source, out = tmp_path / "source.mcap", tmp_path / "part.mcap"
+    write(source, entries(400))
+    write(out, entries(10))
+    before = out.read_bytes()
+    command = [sys.executable, "-c", FULL_DISK, str(LIMIT), "trim", str(source), str(out), "--force"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert done.returncode == 2
+    assert f"{out} can't be written: {os.strerror(errno.EFBIG)}" in done.stderr
+    assert "closed" not in done.stderr
+    assert out.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == [out, source]
+
+
 def test_a_disk_without_any_space_is_one_error():
     """/dev/full refuses every byte."""
     with pytest.raises(ConfigError, match=os.strerror(errno.ENOSPC)):
