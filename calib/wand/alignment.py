@@ -24,10 +24,8 @@ from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
-GRID_S, STEP_S = (
-    1 / 30,
-    0.1,
-)  # time between samples, and over which velocities are averaged: a hand moves below 2 Hz
+GRID_S = 1 / 30  # between samples
+STEP_S = 0.1  # over which velocities are averaged: a hand moves below 2 Hz
 GROSS = 5.0  # times the median: larger velocities are outliers
 MAX_RATE = 0.03  # by which two clocks may differ: 29.97 frames a second read as 30 or 29, 24 as 25 is beyond
 CHANCE = 1e-4  # probability of a false alignment, over all shifts and rates

@@ -163,8 +163,7 @@ class RobotStream(Stream[RobotPose]):
     ) -> None:
         super().__init__(content, timeout_s, cause, age)
         self._now_ns = now_ns
-
-    _located: tuple[RobotPose, float] | None = None  # the newest pose that is not of a lost robot
+        self._located: tuple[RobotPose, float] | None = None  # the newest pose that is not of a lost robot
 
     def latest(self, max_age_s: float | None = None) -> RobotPose | None:
         """The newest pose, or None before the first; with `max_age_s`, None also if it is older or the robot lost.

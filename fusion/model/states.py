@@ -18,6 +18,7 @@ from fusion import _core
 
 THETA, POSITION, OMEGA, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 UNKNOWN_ROTATION = np.pi**2  # variance of an unobservable rotation about the normal, rad^2
+MAX_COAST_S = 30.0  # limit of the prediction interval, and so of the growth of the covariance
 UNKNOWN_RATE = 10.0**2  # variance of an unobservable angular velocity, rad^2/s^2
 
 
@@ -105,9 +106,11 @@ def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[
         single: (N,) bodies with one marker: their normals follow random walks without an angular velocity.
 
     Returns:
-        the predicted states with P = F P F^T + Q, and F.
+        the predicted states with P = F P F^T + Q, `reset_unobservable` of single ones, and F.
     """
     R, p, P, T = _core.predict(states.bodies, states.P, dt, densities, single)
+    if single.any():
+        P[single] = reset_unobservable(P[single])
     return States(R, p, states.omega, states.v, P), Transition(T, dt)
 
 

@@ -19,7 +19,8 @@ MIN_RATIO = 2.0  # of an unusual residual to the usual one
 SLACK_RATIO = 3.0  # of the largest calibration errors to the usual residual
 LEARNED = 15  # frame sets that define what is usual
 REJOINED = 0.01  # probability with which detections that agree are left out once more
-POSE_ERRORS = 6
+POSE_ERRORS = 6  # of a body, which detections determine first
+REJECTED = 100.0  # squared residual, in standard deviations, that a detection far away has
 FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 frame sets a second
 
 
@@ -79,9 +80,6 @@ def costs_of(squared: Array, body: Index, corrections: Array, information: Array
     observed = CAUCHY**2 * np.log1p(np.minimum(squared, REJECTED) / CAUCHY**2)
     predicted = np.einsum("ri,rij,rj->r", corrections, information, corrections)
     return np.bincount(body, observed, len(corrections)) + predicted
-
-
-REJECTED = 100.0  # squared residual, in standard deviations, that a detection far away has
 
 
 def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:

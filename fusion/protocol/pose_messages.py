@@ -19,11 +19,10 @@ from camera_node.protocol.requests import RequestSource
 from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot, load_robots, require_trackable, save_robots
-from fusion.model.states import States, predict, reset_unobservable
+from fusion.model.states import MAX_COAST_S, States, predict
 
 Vector = tuple[float, float, float]
 MAX_NUMBER = 1e5  # of a coordinate or velocity, in metres, m/s or rad/s
-MAX_PREDICTION_S = 30.0  # as the server's own: the covariance then says nothing
 QUATERNION_SLACK = 1e-3  # of the length of a rotation's quaternion
 TrackingState = Literal["tracked", "coasting", "lost"]
 
@@ -104,8 +103,8 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError(
                 f"the pose of '{self.robot}' does not say how its robot moves: update the server"
             )
-        if not abs(dt) <= MAX_PREDICTION_S:
-            raise ValueError(f"{dt:g} s from the pose of '{self.robot}'; {MAX_PREDICTION_S:g} s at most")
+        if not abs(dt) <= MAX_COAST_S:
+            raise ValueError(f"{dt:g} s from the pose of '{self.robot}'; {MAX_COAST_S:g} s at most")
         if dt == 0 or self.state == "lost":
             return msgspec.structs.replace(self, t_ns=t_ns)
         direction = np.repeat([1.0, np.copysign(1.0, dt)], 6)  # of the errors of pose and of velocities
@@ -118,7 +117,7 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
         )
         densities, single = np.array([self.acceleration_density]), np.array([self.body_markers == 1])
         predicted, _ = predict(known, np.array([abs(dt)]), densities, single)
-        P = direction[:, None] * (reset_unobservable(predicted.P) if single else predicted.P)[0] * direction
+        P = direction[:, None] * predicted.P[0] * direction
         return msgspec.structs.replace(
             self,
             t_ns=t_ns,

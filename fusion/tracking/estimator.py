@@ -122,8 +122,6 @@ class Estimator:
     def predict(self, states: States, dt: Array) -> Prediction:
         """Predict all bodies by `dt` (N,) seconds."""
         predicted, motion = predict(states, dt, self.densities, self.single)
-        if self.single.any():
-            predicted.P[self.single] = reset_unobservable(predicted.P[self.single])
         return Prediction(predicted, _core.inverses(predicted.P), motion)
 
     def update(

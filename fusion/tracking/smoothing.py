@@ -9,7 +9,6 @@ The smoothed track of a robot starts where the robot was acquired and ends where
 steps are multiplied, so what later frame sets change decays, and a recording of any length is smoothed in parts.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -43,22 +42,22 @@ class Smoother:
         self._results.append(result)
         if result.t_ns - self._results[0].t_ns < 2 * self._lag_ns:
             return []
-        smoothed = self._smooth(self._results)
-        n = sum(r.t_ns <= result.t_ns - self._lag_ns for r in smoothed)
-        del self._results[:n]
-        return smoothed[:n]
+        smoothed = self._smooth(sum(r.t_ns <= result.t_ns - self._lag_ns for r in self._results))
+        del self._results[: len(smoothed)]
+        return smoothed
 
     def finish(self) -> list[TrackingResult]:
         """The remaining results."""
-        smoothed, self._results = self._smooth(self._results), []
+        smoothed, self._results = self._smooth(len(self._results)), []
         return smoothed
 
-    def _smooth(self, results: Sequence[TrackingResult]) -> list[TrackingResult]:
-        smoothed = [result.step.states for result in results]
-        for k, (result, following) in reversed(list(enumerate(pairwise(results)))):
+    def _smooth(self, n: int) -> list[TrackingResult]:
+        """The first n results, smoothed by all."""
+        smoothed = [result.step.states for result in self._results]
+        for k, (result, following) in reversed(list(enumerate(pairwise(self._results)))):
             step = following.step
             smoothed[k] = _smooth(result.step.states, step.prediction, smoothed[k + 1], step.continued)
-        return [self._with_states(*both) for both in zip(results, smoothed, strict=True)]
+        return [self._with_states(*both) for both in zip(self._results[:n], smoothed[:n], strict=True)]
 
     def _with_states(self, result: TrackingResult, states: States) -> TrackingResult:
         wxyz, P = wxyz_from_rotation(states.R), claimed_covariances(states, result.summary)

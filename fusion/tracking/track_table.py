@@ -9,12 +9,11 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, MarkerTable
 from fusion.model.robots import Robot
-from fusion.model.states import POSITION, THETA, States
+from fusion.model.states import MAX_COAST_S, POSITION, THETA, States
 from fusion.protocol.pose_messages import ShardPoses, TrackingState
 from fusion.protocol.shards import Shard, shard_poses_of, states_of
 from fusion.tracking.gating import START_S, START_SIGMAS
 
-MAX_COAST_S = 30.0  # limit of the prediction interval, and so of the growth of the covariance
 ASSOCIATED_M = 0.1  # position sigma above which a robot is acquired again instead of associated
 ASSOCIATED_RAD = 0.15  # rotation sigma above which a constellation is: its markers may be exchanged
 START_M = 0.1  # standard deviation of `start_m`

@@ -234,7 +234,7 @@ def lens_evidence(adjusted: Adjusted, instead: Array) -> float:
     """Logarithm of the Bayes factor of other lenses, as corrections (C, 9) of the given ones, over the given ones.
 
     In either case the true lenses are off by a share of the usual standard deviations that they have in common, uniform
-    between none and all, so that two sets of lenses are told apart as far as the recording determines the lenses. No
+    between none and all, so that two sets of lenses are distinguished as far as the recording determines the lenses. No
     recording is taken to be better than its detections claim: without noise, rounding would decide.
     """
     claimed = min(1.0, adjusted.scale**2 * adjusted.inflation)

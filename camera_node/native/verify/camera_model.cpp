@@ -183,7 +183,7 @@ bool CameraModel::contradicts(const std::vector<Observation>& roundels) {
     return scores.size() >= kMinWitnesses && median_by(scores, [](double score) { return score; }) > kChanged;
 }
 
-/// Lets the next frames teach all but the prints anew.
+/// Lets the next frames teach all but the prints from the start.
 void CameraModel::forget() {
     sigma_ = edge_noise_ = 0;
     knows_tone_ = knows_curvature_ = false;

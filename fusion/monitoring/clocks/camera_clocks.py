@@ -2,7 +2,7 @@
 """Monitors the clocks of the cameras: excludes a camera whose stamps jumped, finds by how much, and corrects them.
 
     arrival of a frame   -> `ArrivalMonitor`: its stamp jumped, or may?  -> excluded from this frame on
-    the rig graph        -> a clock explains the robots               -> corrected
+    the rig graph        -> a clock alone explains the robots        -> corrected
     an excluded camera   -> `find_time_shift`: by how much?             -> corrected and used again
     slow information     -> `ClockComparison.drifts`                    -> corrected while in use
 
@@ -209,9 +209,9 @@ class CameraClocks:
             if shift.is_zero:
                 self._readmit(name, now_ns)
             elif shift.is_told_apart:
-                self._correct_jump(name, shift.offset_s, shift.sigma_s)
+                self._correct_jump(name, shift.offset_s, shift.sigma_s, clock.since_ns)
         elif jump_ns is not None and waited_ns > STATIC_NS:
-            self._correct_jump(name, -jump_ns * 1e-9, ARRIVAL_SIGMA_S)
+            self._correct_jump(name, -jump_ns * 1e-9, ARRIVAL_SIGMA_S, clock.since_ns)
         elif waited_ns > GIVE_UP_NS:
             self._readmit(name, now_ns)
 
@@ -233,20 +233,18 @@ class CameraClocks:
 
     def correct(self, name: str, offset_s: float, sigma_s: float) -> None:
         """Correct a camera whose clock the rig graph found to be off, unless its frames are searched for it already."""
-        clock = self._clocks[name]
-        if clock.state != "excluded":
-            clock.since_ns = self._now_ns
-            self._correct_jump(name, offset_s, sigma_s)
-            clock.since_ns = 0
+        if self._clocks[name].state != "excluded":
+            self._correct_jump(name, offset_s, sigma_s, self._now_ns)
 
-    def _correct_jump(self, name: str, offset_s: float, sigma_s: float) -> None:
+    def _correct_jump(self, name: str, offset_s: float, sigma_s: float, since_ns: int) -> None:
+        """Correct stamps that jumped at `since_ns`, server time."""
         clock = self._clocks[name]
         clock.correction_ns += round(offset_s * 1e9)
         clock.state, clock.sigma_s, clock.reported_ns = "corrected", sigma_s, clock.correction_ns
         self._arrivals.settle(name)
-        self._comparison.forget_since(clock.since_ns)
+        self._comparison.forget_since(since_ns)
         clock.frames.clear()
-        at = time.strftime("%H:%M:%S", time.localtime(clock.since_ns * 1e-9))
+        at = time.strftime("%H:%M:%S", time.localtime(since_ns * 1e-9))
         message = "camera %s: stamps jumped by %.0f ms at %s; corrected by %.1f ms"
         log.warning(message, name, -1e3 * offset_s, at, 1e3 * offset_s, extra=about(name))
 
