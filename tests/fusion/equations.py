@@ -257,7 +257,9 @@ def predict(states: States, dt: Array, densities: Array, single: Mask) -> tuple[
     T = np.where(single[:, None, None], 0.0, dt[:, None, None] * R_half.transpose(0, 2, 1))
     motion = Transition(T, dt)
     P = motion.multiply(motion.multiply(states.P).transpose(0, 2, 1)) + noise(dt, densities, R_half)
-    for body in np.flatnonzero(single):  # nothing is known of the rotation about the normal and of the angular velocity
+    for body in np.flatnonzero(
+        single
+    ):  # nothing is known of the rotation about the normal and of the angular velocity
         for error, variance in ((2, np.pi**2), (6, 100.0), (7, 100.0), (8, 100.0)):
             P[body, error] = P[body, :, error] = 0
             P[body, error, error] = variance
