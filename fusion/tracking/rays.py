@@ -182,7 +182,8 @@ def fit_motions(rays: Rays, group: Index, near: Array) -> Motions:
     """Least squares for position and velocity of each of K groups of rays.
 
     The ray of time tau passes p + tau v. The prior of v has the standard deviation `MAX_SPEED_M_S` / `SIGMAS` in each
-    direction. The weights follow from the noise at the range of `near` (K, 3).
+    direction. The weights follow from the noise at the range of `near` (K, 3). That is also the prior of p, with the
+    range as standard deviation: cameras side by side do not determine a range.
     """
     rows = np.flatnonzero(group >= 0)
     k, o, d = group[rows], rays.o[rows], rays.d[rows]
@@ -191,10 +192,12 @@ def fit_motions(rays: Rays, group: Index, near: Array) -> Motions:
     across = weight * (np.eye(3)[:, :, None] - d.T[:, None] * d.T)
     side = np.einsum("ijn,nj->in", across, o)
     information, right = np.zeros((len(near), 6, 6)), np.zeros((len(near), 6))
-    information[:, :3, :3] = _sums(across, k, len(near)) + 1e-9 * np.eye(3)
+    prior = 1e-9 + _sums(range_m**-2, k, len(near))  # positive for groups without rays
+    information[:, :3, :3] = _sums(across, k, len(near)) + prior[:, None, None] * np.eye(3)
     information[:, :3, 3:] = information[:, 3:, :3] = _sums(across * tau, k, len(near))
     information[:, 3:, 3:] = _sums(across * tau**2, k, len(near)) + (SIGMAS / MAX_SPEED_M_S) ** 2 * np.eye(3)
-    right[:, :3], right[:, 3:] = _sums(side, k, len(near)), _sums(side * tau, k, len(near))
+    right[:, :3] = _sums(side, k, len(near)) + prior[:, None] * near
+    right[:, 3:] = _sums(side * tau, k, len(near))
     covariance = np.asarray(np.linalg.inv(information), float)
     return Motions(np.einsum("nij,nj->ni", covariance, right), covariance)
 

@@ -21,13 +21,16 @@ import numpy as np
 import tyro
 
 from camera_node.foundation.arrays import Array
-from camera_node.protocol.messages import Detections, decode, encode
-from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.protocol.pose_messages import Latency, RobotPose, ShardPoses
+from camera_node.protocol.messages import Detections, Keys, decode, encode
+from fusion.model.frames import FrameSet
+from fusion.model.limits import Limits
+from fusion.protocol.pose_messages import Latency, RobotPose, ShardPoses, TrackingState
 from fusion.protocol.shards import Shard
 from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.server.ingest import Ingest
 from fusion.server.server import collecting_between_frame_sets
+from fusion.server.server_statistics import PipelineStatus, ServerStatistics
 from fusion.tracking.association import AssociatedFrames
 from fusion.tracking.tracker import Tracker, Update
 from tests.benchmarks.fusion_load import Load
@@ -60,8 +63,7 @@ def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
     with collecting_between_frame_sets():
         queues = [Queue(load, seconds, Shard(k + 1, shards)) for k in range(shards)]
         for message in load.messages(seconds):
-            data, arrival_ns = encode(message), message.t_ns + DELAY_NS
-            sent = [queue.step(data, arrival_ns) for queue in queues]
+            sent = [queue.step(message, message.t_ns + DELAY_NS) for queue in queues]
             for k, queue in enumerate(queues):
                 queue.receive([message for other in (*sent[:k], *sent[k + 1 :]) for message in other])
     each = [queue.sum_up(seconds) for queue in queues]
@@ -77,7 +79,7 @@ def compare(loads: Sequence[Load], seconds: float) -> list[Capacity]:
         for _ in range(math.ceil(seconds / TURN_S)):
             for load, queue, stream in zip(loads, queues, streams, strict=True):
                 for message in islice(stream, math.ceil(load.cameras * load.hz * TURN_S)):
-                    queue.step(encode(message), message.t_ns + DELAY_NS)
+                    queue.step(message, message.t_ns + DELAY_NS)
     return [queue.sum_up(seconds) for queue in queues]
 
 
@@ -110,10 +112,20 @@ class Queue:
         seconds: of the load.
         shard: the robots of this server.
         pace: factor of the measured processor times, to simulate a faster or a slower machine.
+        use: is called with the time of a publication, and its poses.
     """
 
-    def __init__(self, load: Load, seconds: float, shard: Shard = Shard(), pace: float = 1.0) -> None:  # noqa: B008 frozen
-        self.load, self.pace = load, pace
+    def __init__(
+        self,
+        load: Load,
+        seconds: float,
+        shard: Shard = Shard(),  # noqa: B008 frozen
+        pace: float = 1.0,
+        use: Callable[[int, Sequence[RobotPose]], None] | None = None,
+    ) -> None:
+        self.load, self.pace, self._use = load, pace, use
+        self._keys, self._statistics = Keys("load"), ServerStatistics(Limits().lateness_ms)
+        self._ingest = Ingest(self._keys, self._statistics)
         self.tracker = Tracker(load.rig, load.bodies, shard=shard)
         self.tracker.monitors.rig.executor = JudgeProcess()
         self.synchronizer = FrameSynchronizer(round(1e9 / load.hz))
@@ -124,8 +136,9 @@ class Queue:
         self._warm = False
         self._early: AssociatedFrames | None = None
 
-    def step(self, data: bytes, arrival_ns: int) -> list[bytes]:
+    def step(self, message: Detections, arrival_ns: int) -> list[bytes]:
         """Process a message; returns the messages for other shards. The first `START_S` seconds do not count."""
+        data, key = encode(message), self._keys.detections(message.camera)
         self._first_ns = self._first_ns or arrival_ns
         if not self._warm and arrival_ns - self._first_ns > START_S * 1e9:
             self._warm, self.busy_ns, self.free_ns = True, 0, arrival_ns
@@ -134,9 +147,10 @@ class Queue:
         if self.free_ns < arrival_ns:
             self._spend(self._associate_early)
         self.free_ns = max(self.free_ns, arrival_ns)
-        sent = self._take(data, arrival_ns)
+        sent = self._take(data, key, arrival_ns)
         if arrival_ns - self._collected_ns > 1e9:
             self._spend(gc.collect)
+            self._spend(lambda: self._statistics.report(arrival_ns, PipelineStatus()))
             self._collected_ns = arrival_ns
         return sent
 
@@ -154,14 +168,16 @@ class Queue:
         )
         return Capacity(cost_ms, quiet_ms, p50, p99, cpu, float(np.mean(self.tracked.numbers)))
 
-    def _take(self, data: bytes, arrival_ns: int) -> list[bytes]:
-        self._spend(lambda: self._add(data))
+    def _take(self, data: bytes, key: str, arrival_ns: int) -> list[bytes]:
+        self._spend(lambda: self._add(data, key, arrival_ns))
         out: list[bytes] = []
         for frame_set in self._spend(lambda: self.synchronizer.take(arrival_ns)):
             update = self._spend(lambda frame_set=frame_set: self._update(frame_set))
             first = list(update.poses.values())
             self._spend(lambda first=first: self._encode(first))
             done_ns = self.free_ns
+            if self._use is not None:
+                self._use(done_ns, first)
             if self.tracker.shard.count > 1:
                 out.append(self._spend(lambda: encode(self.tracker.table.shard_poses())))
             result = self._spend(lambda update=update: self.tracker.finish(update))
@@ -173,7 +189,9 @@ class Queue:
             self._spend(lambda result=result: encode(result.markers))
             self._spend(lambda frame_set=frame_set, result=result: self.tracker.check_extrinsics(frame_set))
             self._done_ns.append(self.busy_ns)
-            count = sum(pose.state == "tracked" for pose in result.poses)
+            states: dict[str, TrackingState] = {pose.robot: pose.state for pose in result.poses}
+            self._statistics.count_frame_set(result.cameras, states, None)
+            count = sum(state == "tracked" for state in states.values())
             self.tracked.append(count / max(int(self.tracker.table.owned.sum()), 1))
         return out
 
@@ -186,9 +204,13 @@ class Queue:
         if frame_set is not None:
             self._early = self.tracker.associate_early(frame_set, n_missing, self._early)
 
-    def _add(self, data: bytes) -> None:
-        seen = decode(data, Detections)
-        self.synchronizer.add(CalibratedFrame.of(seen, self.load.rig[seen.camera]))
+    def _add(self, data: bytes, key: str, arrival_ns: int) -> None:
+        """As `Server` does."""
+        frame = self._ingest.receive(data, key, arrival_ns, self.load.rig)
+        if frame is not None and (frame := self.tracker.admit(frame)) is not None:
+            self._statistics.note_lateness(
+                frame.camera, self.synchronizer.add(frame), (arrival_ns - frame.t_ns) * 1e-6
+            )
 
     def _encode(self, poses: Sequence[RobotPose]) -> list[bytes]:
         return [encode(msgspec.structs.replace(pose, latency=LATENCY)) for pose in poses]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import tyro
 
-from camera_node.protocol.messages import encode
 from fusion.protocol.shards import Shard
 from fusion.server.server import collecting_between_frame_sets
 from tests.benchmarks.fusion_capacity import DELAY_NS, Queue
@@ -30,9 +29,9 @@ def cold_start(load: Load, seconds: float, shards: int) -> ColdStart:
     start_ns, done_s, most, wrong = 0, math.inf, 0, 0
     with collecting_between_frame_sets():
         for message in load.messages(seconds):
-            data, arrival_ns = encode(message), message.t_ns + DELAY_NS
+            arrival_ns = message.t_ns + DELAY_NS
             start_ns = start_ns or arrival_ns
-            sent = [queue.step(data, arrival_ns) for queue in queues]
+            sent = [queue.step(message, arrival_ns) for queue in queues]
             for k, queue in enumerate(queues):
                 queue.receive([m for other in (*sent[:k], *sent[k + 1 :]) for m in other])
             if not any(sent) and shards > 1:

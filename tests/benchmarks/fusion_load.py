@@ -42,7 +42,13 @@ class Load:
     sigma_px: float = 0.1
     crossing: bool = False  # through the whole arena, instead of each around its own point
     period_s: float | None = None  # after which all motions repeat; never unless given
+    min_px: float = 0.0  # minor axes of smaller outlines are not detected
     seed: int = 1
+
+    @property
+    def half(self) -> np.ndarray:
+        """Half the sides of the floor that robots drive on."""
+        return HALF
 
     @cached_property
     def rig(self) -> dict[str, Camera]:
@@ -70,11 +76,12 @@ class Load:
     def paths(self) -> "Paths":
         rng = np.random.default_rng(self.seed + 1)
         n = self.robots
-        columns = int(np.ceil(np.sqrt(1.6 * n)))
+        half = self.half
+        columns = int(np.ceil(np.sqrt(round(half[0] / half[1], 1) * n)))
         cell = np.column_stack([np.arange(n) % columns, np.arange(n) // columns])
         rows = int(np.ceil(n / columns))
-        centre = (cell + 0.5) / [columns, rows] * 2 * HALF - HALF
-        size = np.tile(HALF * 0.9, (n, 1)) if self.crossing else np.full((n, 2), 0.25)
+        centre = (cell + 0.5) / [columns, rows] * 2 * half - half
+        size = np.tile(half * 0.9, (n, 1)) if self.crossing else np.full((n, 2), 0.25)
         centre = 0 * centre if self.crossing else centre
         rate = rng.uniform(0.7, 1.3, (n, 2)) * self.speed_m_s / size
         turn = rng.uniform(-1.5, 1.5, n) * min(self.speed_m_s, 1.0)
@@ -182,6 +189,7 @@ class Scene:
         sigma = self.load.sigma_px
         uv, axes, angle = outlines(lens, c.T, normal.T, DIAMETER_M / 2)
         inside = ((uv > 10) & (uv < [lens.width - 10, lens.height - 10])).all(1)
+        inside &= axes[:, 1] >= self.load.min_px
         extra = rng.poisson(self.load.false)
         uv = np.concatenate([uv[inside], rng.uniform(10, [lens.width - 10, lens.height - 10], (extra, 2))])
         axes = np.concatenate([axes[inside], np.sort(rng.uniform(10, 30, (extra, 2)))[:, ::-1]])

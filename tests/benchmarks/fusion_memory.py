@@ -11,7 +11,6 @@ import sys
 import numpy as np
 import tyro
 
-from camera_node.protocol.messages import encode
 from fusion.server.server import collecting_between_frame_sets
 from fusion.server.server_statistics import memory_mb
 from tests.benchmarks.fusion_capacity import DELAY_NS, Queue, Series
@@ -34,7 +33,7 @@ def main(seconds: float = 600.0, robots: int = 50) -> None:
         queue = Queue(load, seconds)
         for message in load.messages(seconds):
             at_s = (message.t_ns - START_NS) * 1e-9
-            queue.step(encode(message), message.t_ns + DELAY_NS)
+            queue.step(message, message.t_ns + DELAY_NS)
             if at_s >= (len(times_s) + 1) * EVERY_S:
                 gc.collect()
                 for series, value in (

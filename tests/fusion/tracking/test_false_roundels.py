@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from camera_node.protocol.messages import encode
 from fusion.model.frames import FrameSet
 from fusion.server.server import collecting_between_frame_sets
 from fusion.tracking.marker_search import limit_of
@@ -34,7 +33,7 @@ def test_false_roundels_do_not_delay_the_poses_of_tracked_robots():
     with collecting_between_frame_sets():
         for messages in zip(*streams, strict=True):
             for queue, message in zip(queues, messages, strict=True):
-                queue.step(encode(message), message.t_ns + DELAY_NS)
+                queue.step(message, message.t_ns + DELAY_NS)
     quiet, *others = [queue.sum_up(SECONDS) for queue in queues]
     for crowded in others:
         assert crowded.tracked == 1.0
