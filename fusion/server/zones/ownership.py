@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which zone owns which robot: at most one publishes its poses. Reads no clock and no network.
+
+A claim is a robot's epoch and its owner. Every zone has the largest claim that it has heard of each robot, so all zones
+that hear the same claims agree, whatever their order and repetitions (a last-writer-wins register: Shapiro et al.
+2011). Only the owner hands a robot over, so no two zones own it while messages flow. A robot without an owner, or whose
+owner is dead or has lost it, belongs to whoever finds it. docs/design/zones.md describes the protocol.
+"""
+
+from collections.abc import Iterable, Mapping
+
+from fusion.protocol.zone_messages import Claim, ZoneReport
+
+NOBODY = Claim(0, "", 0)
+
+
+class Ownership:
+    """The claims on all robots, as one zone knows them.
+
+    Args:
+        zone: this zone.
+
+    Attributes:
+        claims: the largest claim on each robot.
+    """
+
+    def __init__(self, zone: str) -> None:
+        self._zone = zone
+        self.claims: dict[str, Claim] = {}
+        self._alive: set[str] = set()  # other zones
+        self._reports: dict[str, ZoneReport] = {}  # the last one of each living zone
+        self._mine: set[str] = set()  # robots that this zone owned at the last report or owns
+        self._lost: frozenset[str] = frozenset()
+        self._follows: frozenset[str] = frozenset()
+
+    @property
+    def others(self) -> frozenset[str]:
+        """The other zones that are alive."""
+        return frozenset(self._alive)
+
+    def note_alive(self, zone: str, is_alive: bool) -> None:
+        """Take note that another zone's server is there, or is not any more."""
+        if is_alive:
+            self._alive.add(zone)
+        else:
+            self._alive.discard(zone)
+            self._reports.pop(zone, None)
+
+    def receive(self, report: ZoneReport) -> None:
+        """Take the claims of another zone's report; a late one can't take any back."""
+        if report.zone == self._zone:
+            return
+        for robot, claim in report.claims.items():
+            self.claims[robot] = max(claim, self.claims.get(robot, NOBODY))
+        last = self._reports.get(report.zone)
+        if report.zone in self._alive and (last is None or report.t_ns > last.t_ns):
+            self._reports[report.zone] = report
+
+    def owns(self, robot: str) -> bool:
+        """Whether this zone owns a robot."""
+        return self._claim(robot).zone == self._zone
+
+    def publishes(self, robot: str, t_ns: int) -> bool:
+        """Whether this zone publishes the robot's pose at `t_ns`: it owns it, and the previous owner published none."""
+        claim = self._claim(robot)
+        return claim.zone == self._zone and t_ns > claim.since_ns
+
+    def searches(self, robot: str) -> bool:
+        """Whether this zone searches for a robot that it does not see: no other zone owns it and sees it."""
+        return self.owns(robot) or self._is_free(robot)
+
+    def followers(self, robot: str) -> list[str]:
+        """The other zones that track a robot without owning it."""
+        return [zone for zone, report in self._reports.items() if robot in report.follows]
+
+    def step(self, t_ns: int, tracked: Iterable[str], lost: Iterable[str], better: Mapping[str, str]) -> bool:
+        """Claim robots that nobody owns, and hand over own ones, after a frame set.
+
+        A zone claims nothing before it has heard what every living zone owns.
+
+        Args:
+            t_ns: time of the frame set.
+            tracked: robots that this zone sees.
+            lost: robots that it does not see any more, or never saw.
+            better: the zone that sees an own robot better, by robot; it must be one of its followers.
+
+        Returns:
+            whether claims changed.
+        """
+        tracked, before = set(tracked), dict(self.claims)
+        if self._alive <= self._reports.keys():
+            for robot in tracked:
+                if not self.owns(robot) and self._is_free(robot):
+                    self.claims[robot] = Claim(self._claim(robot).epoch + 1, self._zone, t_ns)
+        for robot, zone in better.items():
+            if self.publishes(robot, t_ns) and zone in self.followers(robot):
+                self.claims[robot] = Claim(self._claim(robot).epoch + 1, zone, t_ns)
+        self._lost = frozenset(robot for robot in lost if self.owns(robot))
+        self._follows = frozenset(robot for robot in tracked if not self.owns(robot))
+        return self.claims != before
+
+    def report(self, t_ns: int, of_all: bool) -> ZoneReport:
+        """What this zone knows: of all robots, or of those that it owns, or owned at the last report of all."""
+        self._mine |= {robot for robot in self.claims if self.owns(robot)}
+        claims = {k: v for k, v in self.claims.items() if of_all or k in self._mine}
+        if of_all:
+            self._mine = {robot for robot in claims if self.owns(robot)}
+        return ZoneReport(
+            zone=self._zone,
+            t_ns=t_ns,
+            claims=claims,
+            lost=tuple(sorted(self._lost)),
+            follows=tuple(sorted(self._follows)),
+        )
+
+    def rename(self, renamed: Mapping[str, str], known: Iterable[str]) -> None:
+        """Continue with other robots; `renamed` maps old names to new ones."""
+        claims = {renamed.get(robot, robot): claim for robot, claim in self.claims.items()}
+        self.claims = {robot: claims[robot] for robot in known if robot in claims}
+        self._mine = {renamed.get(robot, robot) for robot in self._mine}
+
+    def _claim(self, robot: str) -> Claim:
+        return self.claims.get(robot, NOBODY)
+
+    def _is_free(self, robot: str) -> bool:
+        """Whether no other living zone owns a robot and sees it."""
+        owner = self._claim(robot).zone
+        if owner == self._zone:
+            return False
+        report = self._reports.get(owner)
+        return owner not in self._alive or (report is not None and robot in report.lost)

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Owners of robots in virtual time: one after any faults, and poses without a gap or a double at a crossing."""
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import count
+
+import numpy as np
+import pytest
+
+from camera_node.protocol.messages import MessageError, decode, encode
+from fusion.protocol.zone_messages import Claim, ZoneReport
+from fusion.server.zones.ownership import Ownership
+
+PERIOD_NS = 16_666_667
+LATENCY_NS = 2_000_000
+EXCHANGE = 6  # frame sets between two reports, as of a server at 60 Hz
+Sees = Callable[[str, str, int], bool]
+Better = Callable[[str, str, int], str | None]
+
+
+@dataclass
+class Zone:
+    """A server: its ownership, and the poses that it published."""
+
+    name: str
+    phase_ns: int
+    ownership: Ownership
+    published: list[tuple[int, str]] = field(default_factory=list)
+    n: int = 0
+
+
+class Hall:
+    """Zones whose messages and frame sets happen in the order of a virtual time.
+
+    `sees(zone, robot, t_ns)` tells what a zone's cameras see, `better` which zone sees a robot best. `deliver` returns
+    the delay of a message, or None if it is lost.
+    """
+
+    def __init__(self, names: str, sees: Sees, better: Better, deliver: Callable[[], list[int]]) -> None:
+        self.sees, self.better, self.deliver = sees, better, deliver
+        self.robots = [f"robot{k}" for k in range(5)]
+        self.zones: dict[str, Zone] = {}
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._order, self.now_ns = count(), 0
+        for name in names:
+            self.start(name)
+
+    def start(self, name: str) -> None:
+        zone = Zone(name, len(self.zones) * PERIOD_NS // 3, Ownership(name))
+        for other in self.zones.values():
+            other.ownership.note_alive(name, True)
+            zone.ownership.note_alive(other.name, True)
+        self.zones[name] = zone
+        self._at(self.now_ns + zone.phase_ns + 1, lambda: self._frame_set(zone))
+
+    def kill(self, name: str) -> Zone:
+        for other in self.zones.values():
+            other.ownership.note_alive(name, False)
+        return self.zones.pop(name)
+
+    def run(self, until_ns: int) -> None:
+        while self._events and self._events[0][0] <= until_ns:
+            self.now_ns, _, happen = heapq.heappop(self._events)
+            happen()
+        self.now_ns = until_ns
+
+    def owners(self, robot: str) -> set[str]:
+        return {zone.name for zone in self.zones.values() if zone.ownership.owns(robot)}
+
+    def _at(self, t_ns: int, happen: Callable[[], None]) -> None:
+        heapq.heappush(self._events, (t_ns, next(self._order), happen))
+
+    def _frame_set(self, zone: Zone) -> None:
+        if self.zones.get(zone.name) is not zone:
+            return
+        t_ns, own = self.now_ns, zone.ownership
+        tracked = [robot for robot in self.robots if self.sees(zone.name, robot, t_ns)]
+        zone.published += [(t_ns, robot) for robot in self.robots if own.publishes(robot, t_ns)]
+        zone.n += 1
+        is_due = zone.n % EXCHANGE == 0
+        better = {r: best for r in self.robots if (best := self.better(zone.name, r, t_ns))} if is_due else {}
+        if own.step(t_ns, tracked, set(self.robots) - set(tracked), better) or is_due:
+            self._publish(zone, encode(own.report(t_ns, zone.n % (10 * EXCHANGE) == 0)))
+        self._at(t_ns + PERIOD_NS, lambda: self._frame_set(zone))
+
+    def _publish(self, zone: Zone, data: bytes) -> None:
+        for other in self.zones.values():
+            for delay_ns in self.deliver():
+                self._at(
+                    self.now_ns + delay_ns,
+                    lambda other=other: other.ownership.receive(decode(data, ZoneReport)),
+                )
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_after_any_faults_every_robot_has_one_owner(seed: int):
+    """Zones die, restart and see robots at random, and messages are lost, late, repeated and out of order. Once all
+    messages arrive, the zones that live agree: each robot that one of them sees has an owner that sees it."""
+    rng = np.random.default_rng(seed)
+    seen = rng.random((200, 4, 5)) < 0.4
+    is_calm_ns = 200 * EXCHANGE * PERIOD_NS
+
+    def sees(zone: str, robot: str, t_ns: int) -> bool:
+        return bool(seen[min(t_ns // (EXCHANGE * PERIOD_NS), 199), "abcd".index(zone), int(robot[-1])])
+
+    def deliver() -> list[int]:
+        if hall.now_ns >= is_calm_ns:
+            return [LATENCY_NS]
+        return rng.integers(0, 30 * PERIOD_NS, rng.choice([0, 0, 1, 1, 2])).tolist()
+
+    def better(zone: str, robot: str, t_ns: int) -> str | None:
+        """The first of the living zones that see a robot."""
+        best = min((name for name in hall.zones if sees(name, robot, t_ns)), default=zone)
+        return best if best != zone else None
+
+    hall = Hall("abcd", sees, better, deliver)
+    for k in range(0, 200, 4):
+        hall.run(k * EXCHANGE * PERIOD_NS)
+        name = str(rng.choice(list("abcd")))
+        if name not in hall.zones:
+            hall.start(name)
+        elif len(hall.zones) > 2 and rng.random() < 0.5:
+            hall.kill(name)
+    hall.run(is_calm_ns + 30 * PERIOD_NS)  # the last late message
+    hall.run(hall.now_ns + 30 * EXCHANGE * PERIOD_NS)
+    for robot in hall.robots:
+        claims = {zone.ownership.claims.get(robot) for zone in hall.zones.values()}
+        assert len(claims) == 1, (robot, claims)
+        seeing = {name for name in hall.zones if sees(name, robot, hall.now_ns)}
+        if seeing:
+            assert hall.owners(robot) == {min(seeing)}, "the best zone owns it"
+        assert len(hall.owners(robot)) <= 1
+
+
+def crossing(zone: str, robot: str, t_ns: int) -> bool:
+    """Each robot goes back and forth between both zones within its own time, and both see it at the border."""
+    phase = (t_ns * 1e-9 / (0.9 + 0.3 * int(robot[-1]))) % 2.0
+    place = min(phase, 2.0 - phase)  # 0 to 1 and back
+    return place < 0.7 if zone == "a" else place > 0.3
+
+
+def test_poses_have_no_gap_above_two_frame_sets_and_no_double():
+    """In the last 20 s of crossings, between two zones with frame sets at different times."""
+
+    def better(zone: str, robot: str, t_ns: int) -> str | None:
+        sees = crossing("a", robot, t_ns), crossing("b", robot, t_ns)
+        return (
+            ("b" if zone == "a" else "a")
+            if sees == ((False, True) if zone == "a" else (True, False))
+            else None
+        )
+
+    hall = Hall("ab", crossing, better, lambda: [LATENCY_NS])
+    hall.run(24 * 10**9)
+    for robot in hall.robots:
+        poses = sorted(
+            (t_ns, zone.name)
+            for zone in hall.zones.values()
+            for t_ns, name in zone.published
+            if name == robot
+        )
+        poses = [pose for pose in poses if pose[0] > 4 * 10**9]
+        times = np.array([t_ns for t_ns, _ in poses])
+        changes = sum(one[1] != other[1] for one, other in zip(poses, poses[1:], strict=False))
+        gaps = np.diff(times)
+        assert changes > 5, "it crosses the border"
+        assert gaps.max() <= 2 * PERIOD_NS
+        assert len(times) > (times[-1] - times[0]) / PERIOD_NS - 2 * changes
+        for (t_ns, zone), (later_ns, later) in zip(poses, poses[1:], strict=False):
+            assert zone == later or later_ns - t_ns > 0
+        alternations = sum(a[1] == c[1] != b[1] for a, b, c in zip(poses, poses[1:], poses[2:], strict=False))
+        assert alternations == 0, "two zones publish it at once"
+
+
+def test_two_zones_that_find_a_robot_at_once_agree_after_one_message_each():
+    first, second = Ownership("a"), Ownership("b")
+    for one, name in ((first, "b"), (second, "a")):
+        one.note_alive(name, True)
+        one.receive(ZoneReport(zone=name, t_ns=0))
+        assert one.step(1, ["r"], [], {})
+        assert one.owns("r")
+        assert not one.publishes("r", 1), "before the others have heard of it"
+    first.receive(second.report(1, False))
+    second.receive(first.report(1, False))
+    assert not first.owns("r")
+    assert second.publishes("r", 2)
+
+
+def test_a_zone_claims_nothing_before_it_has_heard_the_living_zones():
+    """Otherwise a restarted server would publish what another one owns."""
+    late = Ownership("b")
+    late.note_alive("a", True)
+    assert not late.step(1, ["r"], [], {})
+    late.receive(ZoneReport(zone="a", t_ns=1, claims={"r": Claim(7, "a", 0)}))
+    assert not late.step(2, ["r"], [], {})
+    late.note_alive("a", False)
+    assert late.step(3, ["r"], [], {}), "of the dead zone"
+    assert late.claims["r"] == Claim(8, "b", 3)
+
+
+def test_a_robot_that_its_owner_lost_is_searched_by_all():
+    zone = Ownership("b")
+    zone.note_alive("a", True)
+    zone.receive(
+        ZoneReport(zone="a", t_ns=1, claims={"r": Claim(1, "a", 0), "s": Claim(1, "a", 0)}, lost=("s",))
+    )
+    assert (zone.searches("r"), zone.searches("s"), zone.searches("new")) == (False, True, True)
+    zone.receive(ZoneReport(zone="a", t_ns=0, lost=("r",)))
+    assert not zone.searches("r"), "a report that is late"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"zone": "a/b"},
+        {"claims": {"r": Claim(0, "a", 0)}},
+        {"claims": {"r": Claim(1 << 62, "a", 0)}},
+        {"claims": {"r": Claim(1, "*", 0)}},
+        {"lost": ("**",)},
+    ],
+)
+def test_invalid_reports_are_refused(wrong: dict):
+    report = {"zone": "a", "t_ns": 0, "claims": {"r": Claim(1, "a", 0)}}
+    assert decode(encode(ZoneReport(**report)), ZoneReport) == ZoneReport(**report)
+    with pytest.raises(MessageError):
+        decode(encode(ZoneReport(**report | wrong)), ZoneReport)
