@@ -8,7 +8,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.config import is_name
-from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz, wxyz_from_rotation
+from camera_node.geometry.pose import rotation_from_wxyz, wxyz_from_rotation
 from camera_node.protocol.messages import VERSION, MessageError
 from fusion.model.states import States
 from fusion.protocol.pose_messages import MAX_NUMBER, QUATERNION_SLACK
