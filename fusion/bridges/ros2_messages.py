@@ -18,14 +18,6 @@ from camera_node.protocol.messages import RelativePositions
 from fusion.bridges.body_motion import covariances, rotations, twists
 from fusion.protocol.pose_messages import RobotPose
 
-# ROS 2 name of a message -> hash of its definition (REP 2016), the same in all releases since Iron
-TYPE_HASHES = {
-    "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
-    "geometry_msgs/msg/PoseWithCovarianceStamped": "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
-    "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
-    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
-}
-
 ENCAPSULATION = b"\0\1\0\0"  # of little-endian CDR
 STAMP, LENGTH, SEVEN = struct.Struct("<II"), struct.Struct("<I"), struct.Struct("<7d")
 ANY_ANGLE = np.pi**2 / 3  # variance of an angle of which nothing is known, square radians
@@ -65,6 +57,35 @@ def transforms(poses: Sequence[RobotPose], frame: str, children: Sequence[str]) 
         parts += [_header(pose.t_ns, _texts(offset + STAMP.size, frame, child)), _numbers(pose)]
         offset = 0
     return b"".join(parts)
+
+
+def named_poses(poses: Sequence[RobotPose], frame: str) -> bytes:
+    """`motion_capture_tracking_interfaces/msg/NamedPoseArray` of poses of one instant."""
+    return _bodies(poses, frame, b"", b"")
+
+
+def rigid_bodies(poses: Sequence[RobotPose], frame: str, number: int) -> bytes:
+    """`mocap4r2_msgs/msg/RigidBodies` of poses of one instant, numbered; without the bodies' markers."""
+    return _bodies(poses, frame, LENGTH.pack(number % 2**32), LENGTH.pack(0))
+
+
+def _bodies(poses: Sequence[RobotPose], frame: str, behind_header: bytes, behind_name: bytes) -> bytes:
+    """A header and a sequence of names with poses; numbers of four bytes may stand between them."""
+    data = bytearray(STAMP.pack(*divmod(poses[0].t_ns, 1_000_000_000)))
+    _append_text(data, frame)
+    data += behind_header + LENGTH.pack(len(poses))
+    for pose in poses:
+        _append_text(data, pose.robot)
+        data += behind_name
+        data += bytes(-len(data) % 8) + _numbers(pose)
+    return ENCAPSULATION + bytes(data)
+
+
+def _append_text(data: bytearray, text: str) -> None:
+    """Append a string, and the padding in front of a number of four bytes."""
+    encoded = text.encode() + b"\0"
+    data += LENGTH.pack(len(encoded)) + encoded
+    data += bytes(-len(data) % LENGTH.size)
 
 
 def relative_poses(message: RelativePositions, frame: str) -> list[bytes]:
@@ -111,8 +132,7 @@ def _texts(offset: int, *texts: str) -> bytes:
     """
     data = bytearray(offset)
     for text in texts:
-        encoded = text.encode() + b"\0"
-        data += bytes(-len(data) % 4) + LENGTH.pack(len(encoded)) + encoded
+        _append_text(data, text)
     return bytes(data[offset:]) + bytes(-len(data) % 8)
 
 

@@ -1,58 +1,77 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Publishes an arena's robots as topics of ROS 2, for nodes that run with RMW_IMPLEMENTATION=rmw_zenoh_cpp.
+"""Publishes an arena's robots as topics of ROS 2. This needs no ROS: `ros2_zenoh.py` and `ros2_dds.py` send the bytes
+that the implementations of ROS's middleware send."""
 
-This needs no ROS: it puts the same bytes on the same Zenoh keys as rmw_zenoh_cpp (its docs/design.md). The key of a
-topic consists of domain, name, type and the type's hash; a liveliness token of the same shows it to `ros2 topic list`.
-"""
-
-import hashlib
 import logging
 import re
-import struct
 import threading
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-
-import zenoh
+from itertools import groupby
+from typing import Literal, Protocol
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.logs import about
 from camera_node.protocol.messages import RelativePositions
-from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, relative_poses, transforms
+from fusion.bridges.ros2_messages import (
+    named_poses,
+    odometries,
+    pose_stamped,
+    relative_poses,
+    rigid_bodies,
+    transforms,
+)
+from fusion.bridges.ros2_types import (
+    NAMED_POSES,
+    ODOMETRY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE_STAMPED,
+    RIGID_BODIES,
+    TRANSFORMS,
+)
 from fusion.protocol.pose_messages import RobotPose
 
 log = logging.getLogger("fusion.ros2")
-NODE = "roundel"
-RELATIVE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-NO_HASH = "TypeHashNotSupported"  # in place of the hash in ROS 2 Humble, which has none
-QOS = "::,10:,:,:,,"  # reliable, volatile, the last ten; everything else is rmw_zenoh's default
 MAX_DOMAIN = 232
 NOT_PERMITTED = re.compile(r"[^A-Za-z0-9_]")
+MessageSet = Literal["crazyswarm2", "mocap4r2"]
+
+
+class Ros2Topic(Protocol):
+    """A publisher of encoded messages."""
+
+    def put(self, data: bytes, is_last: bool) -> bool:
+        """Send a message; if it `is_last` of a burst, without waiting for more. Whether no reader held it up."""
+        ...
+
+
+class Ros2Middleware(Protocol):
+    """What carries topics: Zenoh or DDS."""
+
+    def declare(self, name: str, kind: str) -> Ros2Topic:
+        """A publisher of messages of a kind, such as `nav_msgs/msg/Odometry`, on a topic without a leading slash."""
+        ...
 
 
 class Ros2Node:
-    """A ROS 2 node in a Zenoh session: its publishers and their liveliness tokens. `faults` counts skipped poses.
+    """The topics of an arena's robots. `faults` counts skipped poses and messages.
 
     Args:
-        session: an open Zenoh session.
-        domain: ROS 2's domain.
+        middleware: declares the publishers.
         namespace: prefix of the topics, without slashes at its ends.
-        humble: whether the nodes are of ROS 2 Humble, whose topics have no type hash.
+        sets: sets of messages beside the usual ones: `poses` of Crazyswarm2, `rigid_bodies` of mocap4r2.
     """
 
     def __init__(
-        self, session: zenoh.Session, domain: int = 0, namespace: str = "", humble: bool = False
+        self, middleware: Ros2Middleware, namespace: str = "", sets: Sequence[MessageSet] = ()
     ) -> None:
         self.faults: Counter[str] = Counter()
-        self._session, self._domain, self._humble = session, domain, humble
-        self._namespace = namespace
+        self._middleware, self._namespace, self._sets = middleware, namespace, frozenset(sets)
         self._topics: dict[str, Ros2Topic] = {}
         self._lock = threading.Lock()  # of the topics: positions arrive in Zenoh's threads
         self._robots: dict[str, RobotTopics] = {}  # by name in the arena
-        self._token = session.liveliness().declare_token(self._entity(0, "NN"))
+        self._n_instants = 0
 
     def publish(self, poses: Sequence[RobotPose], frame: str) -> None:
         """Publish `<robot>/pose`, `<robot>/odometry` of the robots that are not lost, and all of them in one `tf`."""
@@ -61,16 +80,31 @@ class Ros2Node:
             return
         robots = [self._robots[pose.robot] for pose in shown]
         names = [robot.name for robot in robots]
-        _send([robot.odometry for robot in robots], odometries(shown, frame, names))
-        _send([robot.pose for robot in robots], [pose_stamped(pose, frame) for pose in shown])
-        _send([self._topic("tf", "tf2_msgs/msg/TFMessage")], [transforms(shown, frame, names)])
+        self._send([robot.odometry for robot in robots], odometries(shown, frame, names))
+        self._send([robot.pose for robot in robots], [pose_stamped(pose, frame) for pose in shown])
+        self._send([self._topic("tf", TRANSFORMS)], [transforms(shown, frame, names)])
+        if self._sets:
+            for _, instant in groupby(shown, lambda pose: pose.t_ns):
+                self._publish_sets(list(instant), frame)
+
+    def _publish_sets(self, poses: Sequence[RobotPose], frame: str) -> None:
+        """Publish the robots of one instant together, by their names in the arena."""
+        self._n_instants += 1
+        if "crazyswarm2" in self._sets:
+            self._send([self._topic(self._named("poses"), NAMED_POSES)], [named_poses(poses, frame)])
+        if "mocap4r2" in self._sets:
+            message = rigid_bodies(poses, frame, self._n_instants)
+            self._send([self._topic(self._named("rigid_bodies"), RIGID_BODIES)], [message])
 
     def publish_relative(self, message: RelativePositions) -> None:
         """Publish `<camera>/relative`: one message for each roundel that the camera locates, in its optical frame."""
         name = ros_name(message.camera)
-        topic = self._topic(f"{self._namespace}/{name}/relative".lstrip("/"), RELATIVE)
+        topic = self._topic(self._named(f"{name}/relative"), POSE_WITH_COVARIANCE_STAMPED)
         messages = relative_poses(message, f"{name}_optical_frame")
-        _send([topic] * len(messages), messages)
+        self._send([topic] * len(messages), messages)
+
+    def _named(self, topic: str) -> str:
+        return f"{self._namespace}/{topic}".lstrip("/")
 
     def _has_topics(self, robot: str) -> bool:
         """Whether the robot has topics or gets them now; if another one has its name in ROS, its poses are counted."""
@@ -81,63 +115,25 @@ class Ros2Node:
         if first is not None:
             self.faults[f"poses of '{robot}', which has the same ROS name as '{first}'"] += 1
             return False
-        prefix = f"{self._namespace}/{name}".lstrip("/")
         self._robots[robot] = RobotTopics(
             name,
-            self._topic(f"{prefix}/pose", "geometry_msgs/msg/PoseStamped"),
-            self._topic(f"{prefix}/odometry", "nav_msgs/msg/Odometry"),
+            self._topic(self._named(f"{name}/pose"), POSE_STAMPED),
+            self._topic(self._named(f"{name}/odometry"), ODOMETRY),
         )
         return True
 
-    def _topic(self, name: str, kind: str) -> "Ros2Topic":
+    def _topic(self, name: str, kind: str) -> Ros2Topic:
         with self._lock:
-            return self._declared(name, kind)
+            if name not in self._topics:
+                log.info("publishes /%s, %s", name, kind, extra=about(name))
+                self._topics[name] = self._middleware.declare(name, kind)
+            return self._topics[name]
 
-    def _declared(self, name: str, kind: str) -> "Ros2Topic":
-        if name not in self._topics:
-            log.info("publishes /%s, %s", name, kind, extra=about(name))
-            package, _, message = kind.split("/")
-            dds = f"{package}::msg::dds_::{message}_"
-            typed = f"{dds}/{NO_HASH if self._humble else 'RIHS01_' + TYPE_HASHES[kind]}"
-            entity = f"{self._entity(len(self._topics) + 1, 'MP')}/%{name.replace('/', '%')}/{typed}/{QOS}"
-            self._topics[name] = Ros2Topic(self._session, f"{self._domain}/{name}/{typed}", entity)
-        return self._topics[name]
-
-    def _entity(self, number: int, kind: str) -> str:
-        """The common part of this node's tokens; slashes in names are replaced by %."""
-        node = f"@ros2_lv/{self._domain}/{self._session.info.zid()}/0/{number}/{kind}"
-        return f"{node}/%/%{self._namespace.replace('/', '%')}/{NODE}"
-
-
-class Ros2Topic:
-    """A publisher as in rmw_zenoh_cpp: the attachment of each message has its number, its time and the sender's id."""
-
-    def __init__(self, session: zenoh.Session, key: str, entity: str) -> None:
-        self._session, self._key = session, key
-        self._publisher = session.declare_publisher(key)
-        self._token = session.liveliness().declare_token(entity)
-        self._gid = hashlib.blake2b(entity.encode(), digest_size=16).digest()
-        self._count = 0
-
-    @cached_property
-    def _express(self) -> zenoh.Publisher:
-        return self._session.declare_publisher(self._key, express=True)
-
-    def put(self, data: bytes, is_last: bool) -> None:
-        """Send a message; if it `is_last` of a burst, without waiting for more."""
-        self._count += 1
-        attachment = struct.pack("<qqB16s", self._count, time.time_ns(), len(self._gid), self._gid)
-        (self._express if is_last else self._publisher).put(data, attachment=attachment)
-
-
-def _send(topics: Sequence[Ros2Topic], messages: Sequence[bytes]) -> None:
-    """Put one message on each topic, as a burst.
-
-    Zenoh waits one or more milliseconds for further messages of a burst, here and in each router, until one of them is
-    express: then it sends all that it has.
-    """
-    for number, (topic, message) in enumerate(zip(topics, messages, strict=True), 1):
-        topic.put(message, is_last=number == len(topics))
+    def _send(self, topics: Sequence[Ros2Topic], messages: Sequence[bytes]) -> None:
+        """Put one message on each topic, as a burst."""
+        for number, (topic, message) in enumerate(zip(topics, messages, strict=True), 1):
+            if not topic.put(message, is_last=number == len(topics)):
+                self.faults["messages that a slow reader held up"] += 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.bridges.foxglove_channels import FoxgloveChannels
 from fusion.bridges.ros2_messages import odometries, pose_stamped, transforms
 from fusion.bridges.ros2_node import ros_name
+from fusion.bridges.ros2_types import ODOMETRY, POSE_STAMPED, TRANSFORMS
 from fusion.export.points import PointTrajectories
 from fusion.export.recorded_poses import RecordedPoses
 from fusion.protocol.pose_messages import RobotPose
@@ -245,10 +246,10 @@ def write_rosbag(poses: RecordedPoses, path: Path) -> None:
         for pose in poses:
             if pose.state != "lost":
                 name = ros_name(pose.robot)
-                put(f"/{name}/pose", "geometry_msgs/msg/PoseStamped", pose.t_ns, pose_stamped(pose, "world"))
+                put(f"/{name}/pose", POSE_STAMPED, pose.t_ns, pose_stamped(pose, "world"))
                 (odom,) = odometries([pose], "world", [name])
-                put(f"/{name}/odometry", "nav_msgs/msg/Odometry", pose.t_ns, odom)
-                put("/tf", "tf2_msgs/msg/TFMessage", pose.t_ns, transforms([pose], "world", [name]))
+                put(f"/{name}/odometry", ODOMETRY, pose.t_ns, odom)
+                put("/tf", TRANSFORMS, pose.t_ns, transforms([pose], "world", [name]))
 
 
 def write_foxglove(poses: RecordedPoses, path: Path) -> None:

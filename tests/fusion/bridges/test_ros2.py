@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh.ext import Int64, z_deserialize
 
 from camera_node.foundation.errors import ConfigError
@@ -21,8 +21,10 @@ from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz
 from camera_node.protocol.messages import ClockReply, Keys, encode
 from camera_node.protocol.session import listening_endpoints, open_router
 from fusion.bridges.body_motion import covariances, rotations, twists
-from fusion.bridges.ros2_messages import TYPE_HASHES, odometries, pose_stamped, transforms
+from fusion.bridges.ros2_messages import named_poses, odometries, pose_stamped, rigid_bodies, transforms
 from fusion.bridges.ros2_node import Ros2Node, ros_name
+from fusion.bridges.ros2_types import DEFINITIONS, NAMED_POSES, RIGID_BODIES, type_hash
+from fusion.bridges.ros2_zenoh import ZenohNode
 from fusion.client.arena import Arena
 from fusion.commands.bridges.ros2 import ros2
 from fusion.model.limits import Limits
@@ -33,6 +35,17 @@ from tests.processes import killed_at_end, run_program
 from tests.waiting import DEADLINE_S, repeating
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
+OTHER_PACKAGES = {  # as their repositories have them
+    "motion_capture_tracking_interfaces/msg/NamedPose": "string name\ngeometry_msgs/Pose pose\n",
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": "std_msgs/Header header\nNamedPose[] poses\n",
+    "mocap4r2_msgs/msg/Marker": "int8 USE_NAME=0\nint8 USE_INDEX=1\nint8 USE_BOTH=2\n\nint8 id_type\n"
+    "int32 marker_index\nstring marker_name\ngeometry_msgs/Point translation\n",
+    "mocap4r2_msgs/msg/RigidBody": "string rigid_body_name\nMarker[] markers\ngeometry_msgs/Pose pose\n",
+    "mocap4r2_msgs/msg/RigidBodies": "std_msgs/Header header\nuint32 frame_number\n"
+    "mocap4r2_msgs/RigidBody[] rigidbodies\n",
+}
+for kind, definition in OTHER_PACKAGES.items():
+    ROS.register(get_types_from_msg(definition, kind))
 
 
 def read(data: bytes, kind: str) -> Any:
@@ -59,9 +72,15 @@ def draw_pose(robot: str = "rover", state: str = "tracked", seed: int = 7) -> Ro
 POSE = draw_pose()
 
 
-@pytest.mark.parametrize("kind", TYPE_HASHES)
+@pytest.mark.parametrize("kind", DEFINITIONS)
 def test_type_hashes_are_those_of_ros(kind):
-    assert ROS.hash_rihs01(kind) == f"RIHS01_{TYPE_HASHES[kind]}"
+    assert ROS.hash_rihs01(kind) == type_hash(kind)
+
+
+def test_the_hash_is_the_one_that_ros_prints():
+    """`ros2 topic info --verbose` of Jazzy."""
+    printed = "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
+    assert type_hash("geometry_msgs/msg/PoseStamped") == printed
 
 
 @pytest.mark.parametrize("frame", ["", "map", "world", "arena1"])  # lengths with every remainder modulo four
@@ -71,6 +90,8 @@ def test_type_hashes_are_those_of_ros(kind):
         ("geometry_msgs/msg/PoseStamped", lambda frame: pose_stamped(POSE, frame)),
         ("nav_msgs/msg/Odometry", lambda frame: odometries([POSE], frame, ["rover"])[0]),
         ("tf2_msgs/msg/TFMessage", lambda frame: transforms([POSE, POSE], frame, ["rover", "drone1"])),
+        (NAMED_POSES, lambda frame: named_poses([POSE, draw_pose("cf-231")], frame)),
+        (RIGID_BODIES, lambda frame: rigid_bodies([POSE, draw_pose("cf-231")], frame, 7)),
     ],
 )
 def test_bytes_are_those_of_ros(kind, write, frame):
@@ -248,7 +269,7 @@ def test_robots_with_equal_ros_names_are_counted():
         "_re",
     ]
     with routing() as (session, _):
-        node = Ros2Node(session)
+        node = Ros2Node(ZenohNode(session))
         node.publish([draw_pose(name) for name in ("rover-2", "rover_2", "rover_2")], "world")
         assert node.faults == {"poses of 'rover_2', which has the same ROS name as 'rover-2'": 2}
 
@@ -258,7 +279,7 @@ def test_the_last_message_of_each_burst_is_express():
     received, names = queue.Queue(), ["a", "b", "c"]
     with routing() as (session, _):
         subscriber = session.declare_subscriber("0/**", received.put)
-        Ros2Node(session).publish([draw_pose(name) for name in names], "world")
+        Ros2Node(ZenohNode(session)).publish([draw_pose(name) for name in names], "world")
         samples = [received.get(timeout=DEADLINE_S) for _ in range(2 * len(names) + 1)]
         subscriber.undeclare()
     topics = [f"{name}/{kind}" for kind in ("odometry", "pose") for name in names] + ["tf"]

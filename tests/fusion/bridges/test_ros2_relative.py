@@ -12,7 +12,7 @@ from camera_node.geometry.pose import rotation_from_wxyz
 from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.session import open_client, open_router
 from fusion.bridges.ros2_messages import ANY_ANGLE, relative_poses
-from fusion.bridges.ros2_node import RELATIVE
+from fusion.bridges.ros2_types import POSE_WITH_COVARIANCE_STAMPED as RELATIVE
 from tests.camera_node.protocol.positions import pack_random
 from tests.conftest import free_port
 from tests.processes import running
