@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Launches `roundel ros2` beside other nodes of ROS 2: ros2 launch configs/ros2/roundel.launch.py arena:=lab."""
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess
-from launch.substitutions import EnvironmentVariable, LaunchConfiguration, PythonExpression
+from launch import LaunchDescription  # pyright: ignore[reportMissingImports]: of ROS
+from launch.actions import DeclareLaunchArgument, ExecuteProcess  # pyright: ignore[reportMissingImports]: of ROS
+from launch.substitutions import EnvironmentVariable, LaunchConfiguration, PythonExpression  # pyright: ignore[reportMissingImports]: of ROS
 
 DEFAULTS = {
     "connect": ("tcp/localhost:7447", "the arena's server"),
