@@ -17,7 +17,7 @@ from cyclonedds.util import duration
 
 from fusion.bridges.ros2_dds import ON_LOOPBACK
 from tests.conftest import ROOT
-from tests.fusion.bridges.test_ros2 import POSE, ROS, bridging, draw_pose, publishing, routing
+from tests.fusion.bridges.ros2_arena import POSE, ROS, bridging, draw_pose, publishing, routing
 from tests.processes import run_program
 from tests.waiting import wait_for
 
