@@ -17,9 +17,11 @@ from web.state.recording_player import RecordingPlayer
 from web.state.subscription import Subscription
 from web.tabs.calibration_panels import CalibrationFiles, CalibrationInForce, RigHistoryPanel
 from web.tabs.camera_tab import CameraSettings, CameraTable, LivePictures
+from web.tabs.graph_panel import GraphPanel
 from web.tabs.marker_picker import MarkerPicker
 from web.tabs.record_tab import Recorder, RecordingList, ReplayControls
 from web.tabs.robot_tab import RobotEditor, RobotTable
+from web.tabs.ruler import Ruler
 from web.tabs.status_tab import StatusTab
 from web.tabs.wand_session import WandSessionPanel
 from web.tabs.world_panel import WorldPanel
@@ -123,6 +125,7 @@ def add_live_page(
         view.add(RobotTable(gui))
         view.add(RobotEditor(gui, subscription, folder), is_live=True)
         view.add(MarkerPicker(view.server, subscription), is_live=True)
+        add_instruments(view)
     with header.tabs["Record"]:
         recorder = Recorder(gui, subscription, folder)
         closing.callback(recorder.close)
@@ -166,7 +169,16 @@ def add_replay_page(view: View, player: RecordingPlayer) -> None:
         view.add(CameraTable(gui))
     with header.tabs["Robots"]:
         view.add(RobotTable(gui))
+        add_instruments(view)
     with header.tabs["Record"]:
         view.add(ReplayControls(gui, player))
     with header.tabs["Status"]:
         view.add(StatusTab(gui, "", player.arena))
+
+
+def add_instruments(view: View) -> tuple[GraphPanel, Ruler]:
+    """Add what plots and measures, in the arena and in a recording."""
+    graph, ruler = GraphPanel(view.server.gui), Ruler(view.server)
+    view.add(graph, interval=1)
+    view.add(ruler, interval=1)
+    return graph, ruler

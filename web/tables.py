@@ -97,8 +97,13 @@ def _heading(pose: RobotPose) -> str:
     R = rotation_from_wxyz(pose.quaternion_wxyz)
     up = R[2]  # the world's z axis in the body's frame, which is that of the covariance
     sigma = np.degrees(np.sqrt(max(0.0, float(up @ pose.covariance_matrix[:3, :3] @ up))))
-    degrees = np.degrees(np.arctan2(R[1, 0], R[0, 0]))
-    return f"{degrees:+.0f}" if sigma < MAX_HEADING_SIGMA else NO_VALUE
+    return f"{heading_degrees(pose):+.0f}" if sigma < MAX_HEADING_SIGMA else NO_VALUE
+
+
+def heading_degrees(pose: RobotPose) -> float:
+    """Direction of the x axis in the world's x-y plane, counterclockwise from the world's."""
+    R = rotation_from_wxyz(pose.quaternion_wxyz)
+    return float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
 
 
 def format_sigma(sigma_mm: float) -> str:

@@ -54,7 +54,7 @@ class View:
         self.server.gui.configure_theme(
             dark_mode=True, control_width="large", show_logo=False, show_share_button=False
         )
-        self._sections: list[tuple[PanelSection, bool]] = []
+        self._sections: list[tuple[PanelSection, bool, int]] = []
         self._drawings = 0
         self._rig: Rig | None = None
         self.cameras = CameraDrawing(self.server.scene)
@@ -100,14 +100,17 @@ class View:
             self.discs.draw(state)
             self.true_points.draw(state)
             self._relative.draw(state)
-            if self._drawings % PANEL_INTERVAL == 0:
-                for section, is_live in self._sections:
+            for section, is_live, interval in self._sections:
+                if self._drawings % interval == 0:
                     section.update(live if is_live else state)
         self._drawings += 1
 
-    def add(self, section: PanelSection, is_live: bool = False) -> None:
-        """Update further controls of the panel; live ones act on the arena, also while a recording is shown."""
-        self._sections.append((section, is_live))
+    def add(self, section: PanelSection, is_live: bool = False, interval: int = PANEL_INTERVAL) -> None:
+        """Update further controls of the panel in one of `interval` drawings.
+
+        Live ones act on the arena, also while a recording is shown.
+        """
+        self._sections.append((section, is_live, interval))
 
     def reset_view(self) -> None:
         """Show the whole arena in all browsers, present and future."""

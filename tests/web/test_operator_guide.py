@@ -48,6 +48,7 @@ COMMAND_TESTS = {
     "robots turn": ("tests/fusion/model/test_robot_frame.py", 'robots("turn"'),
     "robots save": ("tests/fusion/model/test_robot_frame.py", 'robots("save"'),
     "define": ("tests/fusion/client/test_define.py", '"define"'),
+    "plot": ("tests/fusion/export/test_plots.py", "plot(recording)"),
     "record": ("tests/fusion/recordings/test_exact_replay.py", '"record"'),
     "recordings list": ("tests/web/test_record_tab.py", 'recordings("list"'),
     "recordings rename": ("tests/web/test_record_tab.py", 'recordings("rename"'),
@@ -104,7 +105,7 @@ def page_controls(tmp_path: Path) -> Iterator[set[tuple[str, str]]]:
 def test_the_guide_names_every_control(page_controls: set[tuple[str, str]]):
     """In the section of its tab, and no other one; folders are named too."""
     named = controls_of(rows())
-    folders = {"Log", "Skipped messages"}
+    folders = {"Log", "Skipped messages", "Graph"}
     assert {(tab, name) for tab, name in named if name not in folders} == page_controls
     assert {tab for tab, _, _ in rows()} == {"Header", *TABS}
 

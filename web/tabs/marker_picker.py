@@ -18,11 +18,11 @@ from fusion.errors import FusionError
 from web.colours import SELECTED
 from web.condition import next_step
 from web.html_tables import small
+from web.scene.clicks import nearest_to_ray
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_content, set_property
 
-MAX_ANGLE_RAD = 0.03  # between the ray of a click and the direction of the selected marker
 MARKERS_S = 1.0  # age up to which the latest markers can be selected
 MEASURE_S = 1.5  # for which the markers of the new robot are measured
 SAME_M = 0.05  # distance up to which a measured marker is the selected one
@@ -88,12 +88,10 @@ class MarkerPicker:
 
     def select(self, origin: ArrayLike, direction: ArrayLike) -> None:
         """Select the marker nearest to a ray (world), or deselect it."""
-        ray = np.asarray(direction, float) / np.linalg.norm(direction)
-        to_marker = self._unlabeled - np.asarray(origin, float)
-        angle = np.linalg.norm(np.cross(to_marker, ray), axis=1) / np.maximum(to_marker @ ray, 1e-9)
-        if not self._active or not len(angle) or np.nanmin(angle) > MAX_ANGLE_RAD:
+        row = nearest_to_ray(self._unlabeled, origin, direction) if self._active else None
+        if row is None:
             return
-        marker = self._unlabeled[np.nanargmin(angle)]
+        marker = self._unlabeled[row]
         others = [point for point in self.selected if np.linalg.norm(point - marker) > SAME_M]
         self.selected = others if len(others) < len(self.selected) else [*self.selected, marker]
         self._answer_with(
