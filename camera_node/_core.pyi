@@ -3,6 +3,10 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+CODE_SECTORS: int
+CODE_RADII: tuple[float, float]  # of the ring of sectors, outer radii of the roundel
+
+def code_words() -> list[int]: ...  # see `geometry.codes`
 def distance_by_principal_axis(diameter: float, major: float) -> float: ...
 def disc_pictures(
     position: NDArray[np.float64], normal: NDArray[np.float64]

@@ -14,6 +14,7 @@ from camera_node.foundation.config import dump_yaml, example_file, load_yaml, wr
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from camera_node.geometry.body import Body, PrintedWand
+from camera_node.geometry.codes import is_code, words
 from camera_node.printing.drawing import Page, write_pages
 from camera_node.printing.sheets import Card, board_page, body_page, card_pages, cards_for_page
 
@@ -45,6 +46,8 @@ class Sheet:
     """roundels: inner over outer diameter, d_i / d_o."""
     surround_ratio: float = 9 / 7
     """roundels: white card over outer diameter, d / d_o; increase it for dark floors and distant cameras."""
+    codes: str | None = None
+    """roundels: print those with these codes, such as 1-12 or 3,7,20-25; plain ones unless given."""
     paper: str = "a4"
     """a4, a3, a2, letter or tabloid."""
     file: Path | None = None
@@ -80,17 +83,20 @@ class Sheet:
         return [page], f"for the lens calibration: --board {spec}"
 
     def _roundels(self) -> tuple[list[Page], str]:
+        numbers = parse_codes(self.codes) if self.codes is not None else []
         try:
             body = Body(
                 diameter_m=DIAMETER_M if self.diameter is None else self.diameter,
                 inner_ratio=self.inner_ratio,
                 surround_ratio=self.surround_ratio,
+                code=numbers[0] if numbers else (),
             )
         except ValueError as error:
             raise ConfigError(f"invalid sheet: {error}") from None
         size = f"d_o = {1e3 * body.diameter_m:g} mm"
-        count = cards_for_page(body, self.paper)
-        cards = [Card(body, f"{k + 1}  {size}") for k in range(count)]
+        count = len(numbers) or cards_for_page(body, self.paper)
+        cards = [Card(body, f"code {k}  {size}", k) for k in numbers]
+        cards = cards or [Card(body, f"{k + 1}  {size}") for k in range(count)]
         roundels = "1 roundel" if count == 1 else f"{count} roundels"
         return card_pages(cards, self.paper, size), f"{roundels} of {size}; diameter_m: {body.diameter_m:g}"
 
@@ -127,7 +133,8 @@ class Sheet:
         if body.normals:
             faces = (_listed(round(x, 3) for x in normal) for normal in body.normals)
             places = [f"{place} facing ({face})" for place, face in zip(places, faces, strict=True)]
-        cards = [Card(body, f"{name} {k}: {place}") for k, place in enumerate(places, 1)]
+        marked = enumerate(zip(places, body.codes, strict=True), 1)
+        cards = [Card(body, f"{name} {k}: {place}", code) for k, (place, code) in marked]
         return card_pages(cards, self.paper, title)
 
     def _write_yaml(self, path: Path, name: str, body: Body) -> str:
@@ -139,6 +146,17 @@ class Sheet:
         return (
             f"wrote {path}, which describes the print: {len(body.markers)} roundels of {body.diameter_m:g} m"
         )
+
+
+def parse_codes(text: str) -> list[int]:
+    """The codes that a text such as 3,7,20-25 lists; raises ConfigError for another text and for unknown codes."""
+    parts = [part.split("-") for part in text.split(",")]
+    if not all(len(part) <= 2 and all(end.strip().isdecimal() for end in part) for part in parts):
+        raise ConfigError(f"--codes {text} is no list of codes; give numbers and ranges such as 3,7,20-25")
+    ends = [(int(part[0]), int(part[-1])) for part in parts]
+    if bad := [end for pair in ends for end in pair if not is_code(end)]:
+        raise ConfigError(f"--codes {text}: there is no code {bad[0]}; give 1 to {len(words())}")
+    return [code for first, last in ends for code in range(first, last + 1)]
 
 
 def _listed(numbers: Iterable[float]) -> str:

@@ -7,6 +7,8 @@ import msgspec
 import numpy as np
 
 from camera_node.foundation.arrays import Array
+from camera_node.geometry import codes
+from camera_node.geometry.pose import rotation_with_z
 
 Vector = tuple[float, float, float]
 MAX_EXTENT_M = 10.0  # of a marker's coordinates and of a roundel's diameter
@@ -24,7 +26,9 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         normals: directions out of the prints, one for each marker, body frame, scaled to unit vectors; empty if all
             are +z.
         inner_ratio: d_i / d_o, diameter of the white inner disc over d_o; 0.6 in the paper.
-        surround_ratio: d / d_o, diameter of the white card over d_o; 9/7 in the paper.
+        surround_ratio: d / d_o, diameter of the white card over d_o; 9/7 in the paper. Cards of codes are at least as
+            large as the code needs.
+        code: number of the code around the roundel, or of each marker's, 0 for one without; none unless given.
     """
 
     diameter_m: float
@@ -32,6 +36,7 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     normals: tuple[Vector, ...] = ()
     inner_ratio: float = 0.6
     surround_ratio: float = 9 / 7
+    code: int | tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0.001 <= self.diameter_m <= MAX_EXTENT_M:
@@ -46,7 +51,24 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             )
         if not (0.1 <= self.inner_ratio <= 0.95 and 1.0 <= self.surround_ratio <= 10):
             raise ValueError("inner_ratio must be in [0.1, 0.95] and surround_ratio in [1, 10]")
+        self._check_codes()
         self._scale_normals()
+
+    @property
+    def codes(self) -> tuple[int, ...]:
+        """The code of each marker, 0 for one without."""
+        numbers = (self.code,) if isinstance(self.code, int) else self.code
+        return numbers or (codes.PLAIN,) * len(self.markers)
+
+    @property
+    def code_axes(self) -> Array:
+        """(M, 3) unit vectors to the zeros of the codes, body frame: the x axis where a print faces +z."""
+        return rotation_with_z(self.unit_normals)[:, :, 0]
+
+    @property
+    def card_ratio(self) -> float:
+        """Diameter of the largest card over d_o."""
+        return max(self.surround_ratio, codes.CARD) if any(self.codes) else self.surround_ratio
 
     @property
     def points(self) -> Array:
@@ -59,8 +81,21 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         return np.array(self.normals or (UP,) * len(self.markers), float)
 
     def has_markers_of(self, other: "Body") -> bool:
-        """Whether both have the same markers, with the same normals."""
-        return self.markers == other.markers and self.normals == other.normals
+        """Whether both have the same markers, with the same normals and codes."""
+        same = self.markers == other.markers and self.normals == other.normals
+        return same and self.codes == other.codes
+
+    def _check_codes(self) -> None:
+        """Raise ValueError for codes that do not exist, that are there twice, or that are not one for each marker."""
+        if len(self.codes) != len(self.markers):
+            raise ValueError(
+                f"{len(self.codes)} codes for {len(self.markers)} markers; give one for each, 0 for one without"
+            )
+        used = [number for number in self.codes if number != codes.PLAIN]
+        if unknown := [number for number in used if not codes.is_code(number)]:
+            raise ValueError(f"there is no code {unknown[0]}; give 1 to {len(codes.words())}")
+        if len(set(used)) < len(used):
+            raise ValueError("two markers have the same code; print another one for each")
 
     def _scale_normals(self) -> None:
         """Make unit vectors of the normals; raise ValueError where one has no direction."""

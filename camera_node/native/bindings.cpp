@@ -5,6 +5,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "bind_lens.hpp"
+#include "code/code_book.hpp"
 #include "detector.hpp"
 #include "frame_columns.hpp"
 
@@ -67,6 +68,9 @@ static nb::object explain(roundel::Detector& detector, const GreyImage& image) {
 
 NB_MODULE(_core, m) {
     bind_lens(m);
+    m.attr("CODE_SECTORS") = roundel::kCodeSectors;
+    m.attr("CODE_RADII") = nb::make_tuple(roundel::kCodeInner, roundel::kCodeOuter);
+    m.def("code_words", [] { return roundel::code_words(); });
     m.def("distance_by_principal_axis", &roundel::distance_by_principal_axis, nb::arg("diameter"),
           nb::arg("major"));
     nb::class_<roundel::RoundelLimits>(m, "RoundelLimits")

@@ -40,6 +40,13 @@ class Box:
 
 
 @dataclass(frozen=True)
+class Polygon:
+    """A black polygon, by its corners."""
+
+    corners: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
 class Stroke:
     """A thin line; `grey` as of a circle."""
 
@@ -60,7 +67,7 @@ class Label:
     size: float = TEXT_MM
 
 
-Shape = Circle | Box | Stroke | Label
+Shape = Circle | Box | Polygon | Stroke | Label
 
 
 @dataclass
@@ -110,6 +117,8 @@ def _svg_shape(shape: Shape) -> str:
         return f'<circle cx="{shape.x:.4f}" cy="{shape.y:.4f}" r="{shape.radius:.4f}" {paint}/>'
     if isinstance(shape, Box):
         return f'<rect x="{shape.x:.4f}" y="{shape.y:.4f}" width="{shape.width:.4f}" height="{shape.height:.4f}"/>'
+    if isinstance(shape, Polygon):
+        return f'<polygon points="{" ".join(f"{x:.4f},{y:.4f}" for x, y in shape.corners)}"/>'
     if isinstance(shape, Stroke):
         ends = f'x1="{shape.x0:.4f}" y1="{shape.y0:.4f}" x2="{shape.x1:.4f}" y2="{shape.y1:.4f}"'
         return f'<line {ends} stroke="{_svg_grey(shape.grey)}" stroke-width="{LINE_MM}"/>'
@@ -149,6 +158,13 @@ def _pdf_shape(canvas: Any, shape: Shape, height: float) -> None:
     elif isinstance(shape, Box):
         canvas.setFillGray(0.0)
         canvas.rect(shape.x, height - shape.y - shape.height, shape.width, shape.height, stroke=0, fill=1)
+    elif isinstance(shape, Polygon):
+        canvas.setFillGray(0.0)
+        outline = canvas.beginPath()
+        for k, (x, y) in enumerate(shape.corners):
+            (outline.lineTo if k else outline.moveTo)(x, height - y)
+        outline.close()
+        canvas.drawPath(outline, stroke=0, fill=1)
     elif isinstance(shape, Stroke):
         canvas.setStrokeGray(shape.grey)
         canvas.line(shape.x0, height - shape.y0, shape.x1, height - shape.y1)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The sheets to print: roundels on cards, bodies of several roundels, and ChArUco boards."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,8 +9,9 @@ import cv2
 import numpy as np
 
 from camera_node.foundation.errors import ConfigError
+from camera_node.geometry import codes
 from camera_node.geometry.body import Body
-from camera_node.printing.drawing import GREY, Box, Circle, Label, Page, Shape, Stroke
+from camera_node.printing.drawing import GREY, Box, Circle, Label, Page, Polygon, Shape, Stroke
 
 PAPER_MM = {
     "a4": (210.0, 297.0),
@@ -21,6 +23,7 @@ PAPER_MM = {
 MARGIN_MM = 8.0  # unprintable margin of most printers
 RULER_MM = 100
 FOOT_MM = 14.0  # at the lower edge, for the ruler
+ARC_RAD = 0.02  # of a code between two corners of its outline: 5 um from the circle for 180 mm
 CUT_MM = 4.0  # length of cut marks
 MARKER_RATIO, DICTIONARY = (
     0.75,
@@ -30,10 +33,11 @@ MARKER_RATIO, DICTIONARY = (
 
 @dataclass(frozen=True)
 class Card:
-    """A roundel on a card: its body and the text beside it."""
+    """A roundel on a card: its body, the text beside it, and its code, 0 for none, whose zero is to the right."""
 
     body: Body
     text: str
+    code: int = codes.PLAIN
 
 
 def paper_size(name: str) -> tuple[float, float]:
@@ -63,7 +67,7 @@ def card_pages(cards: Sequence[Card], paper: str, title: str) -> list[Page]:
         for k, card in enumerate(cards[first : first + columns * rows]):
             x = (k % columns + 0.5) * width / columns
             y = MARGIN_MM + (k // columns + 0.5) * (height - MARGIN_MM - FOOT_MM) / rows
-            page.shapes += roundel(card.body, x, y, card.text)
+            page.shapes += roundel(card, x, y)
         pages.append(page)
     return pages
 
@@ -80,22 +84,35 @@ def _grid(body: Body, paper: str) -> tuple[int, int]:
 
 def card_size(body: Body) -> float:
     """Side of the square card of a roundel, mm."""
-    return 1e3 * body.diameter_m * body.surround_ratio
+    return 1e3 * body.diameter_m * body.card_ratio
 
 
-def roundel(body: Body, x: float, y: float, text: str) -> list[Shape]:
-    """A roundel with its card's outline, cut marks and a text in the card's lower left corner."""
-    radius, half = 500 * body.diameter_m, card_size(body) / 2
-    shapes: list[Shape] = [
-        Circle(x, y, half),
-        Circle(x, y, radius, 0.0),
-        Circle(x, y, body.inner_ratio * radius, 1.0),
-    ]
+def roundel(card: Card, x: float, y: float) -> list[Shape]:
+    """A roundel with its card's outline, cut marks and a text in the card's lower left corner.
+
+    A line from the edge of the card points to the zero of a code.
+    """
+    body, half = card.body, card_size(card.body) / 2
+    shapes: list[Shape] = [Circle(x, y, half), *_print(body, x, y, card.code)]
+    if card.code:
+        shapes.append(Stroke(x + half, y, x + half - CUT_MM, y, GREY))
     for sx in (-1, 1):
         for sy in (-1, 1):
             u, v = x + sx * half, y + sy * half
             shapes += [Stroke(u, v, u - sx * CUT_MM, v, GREY), Stroke(u, v, u, v - sy * CUT_MM, GREY)]
-    return [*shapes, Label(x - half + 1, y + half - 1.2, text, 2.5)]
+    return [*shapes, Label(x - half + 1, y + half - 1.2, card.text, 2.5)]
+
+
+def _print(body: Body, x: float, y: float, code: int, zero: float = 0.0) -> list[Shape]:
+    """The black and white discs of a roundel, and its code, whose zero is at `zero` radians from the right, upwards."""
+    radius = 500 * body.diameter_m
+    shapes: list[Shape] = [Circle(x, y, radius, 0.0), Circle(x, y, body.inner_ratio * radius, 1.0)]
+    for start, end in codes.arcs(code) if code else ():
+        angles = zero + np.linspace(start, end, max(2, math.ceil((end - start) / ARC_RAD) + 1))
+        ring = np.column_stack([np.cos(angles), -np.sin(angles)]) * radius
+        corners = np.concatenate([codes.INNER * ring, codes.OUTER * ring[::-1]]) + np.array([x, y])
+        shapes.append(Polygon(tuple(map(tuple, corners.tolist()))))
+    return shapes
 
 
 def body_page(body: Body, paper: str, name: str, title: str) -> Page | None:
@@ -103,7 +120,8 @@ def body_page(body: Body, paper: str, name: str, title: str) -> Page | None:
 
     The page is the body seen from above: x points up, y left. The body's origin is a small cross.
     """
-    points, half = 1e3 * body.points, 500 * body.diameter_m
+    points = 1e3 * body.points
+    half = 500 * body.diameter_m * (codes.OUTER if any(body.codes) else 1)
     if np.ptp(points[:, 2]) > 0 or body.normals:
         return None  # roundels at different heights, or on several sides, are on different cards
     width, height = paper_size(paper)
@@ -121,11 +139,9 @@ def body_page(body: Body, paper: str, name: str, title: str) -> Page | None:
 
     for k, point in enumerate(points):
         x, y = place(point[:2])
-        page.shapes += [
-            Circle(x, y, half, 0.0),
-            Circle(x, y, body.inner_ratio * half, 1.0),
-            Label(x - 1.5, y + 1, str(k + 1), 2.5),
-        ]
+        code = body.codes[k]
+        text = str(k + 1) if code == codes.PLAIN else f"{k + 1}: {code}"
+        page.shapes += [*_print(body, x, y, code, math.pi / 2), Label(x - 1.5, y + 1, text, 2.5)]
     x, y = place(np.zeros(2))
     page.shapes += [Stroke(x - 3, y, x + 3, y), Stroke(x, y - 3, x, y + 3)]
     page.shapes += [Label(MARGIN_MM, MARGIN_MM + 3, f"{name}: x points to the upper edge, y to the left one")]

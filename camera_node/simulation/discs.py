@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from camera_node.foundation.arrays import Array
+from camera_node.geometry import codes
 from camera_node.geometry.body import Body, thickness_of
 from camera_node.geometry.pose import rotation_with_z
 from camera_node.simulation.floor import Picture
@@ -31,10 +32,14 @@ Key = TypeVar("Key")
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """A printed roundel in front of a camera: T_cam_disc (4, 4), and radii of card, black and white disc, metres."""
+    """A printed roundel in front of a camera: T_cam_disc (4, 4), and radii of card, black and white disc, metres.
+
+    The zero of its `code`, 0 for none, is on the x axis.
+    """
 
     T: Array
     radii: tuple[float, float, float]
+    code: int = codes.PLAIN
 
     @property
     def faces_camera(self) -> bool:
@@ -57,14 +62,13 @@ class Disc:
         return self.radii[0] * POLYGON @ self.T[:3, :2].T + self.T[:3, 3]
 
     def intersect(self, rays: Picture, heights: Array) -> Picture:
-        """Distances (h, w) from the disc's centre, metres, at which rays intersect its plane.
+        """Points (h, w, 2) of the disc's plane at which rays intersect it, from its centre, metres.
 
         Args:
             rays: (h, w, 2) x/z and y/z.
             heights: (h,) of the rows in the image (`Lens.image_row`).
         """
-        points = cv2.perspectiveTransform(rays, np.linalg.inv(self.plane))
-        return np.asarray(cv2.magnitude(points[..., 0], points[..., 1]), np.float32)
+        return np.asarray(cv2.perspectiveTransform(rays, np.linalg.inv(self.plane)), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,11 @@ class RollingDisc:
     def radii(self) -> tuple[float, float, float]:
         """Of card, black and white disc, metres."""
         return self.discs[MIDDLE].radii
+
+    @property
+    def code(self) -> int:
+        """The number of its code, 0 for none."""
+        return self.discs[MIDDLE].code
 
     @property
     def faces_camera(self) -> bool:
@@ -95,20 +104,21 @@ class RollingDisc:
     def intersect(self, rays: Picture, heights: Array) -> Picture:
         """As `Disc.intersect`, of each row with the disc at the time at which the row is read."""
         planes = np.array([disc.plane for disc in self.discs])
-        return _distances(np.linalg.inv(np.einsum("rk,kij->rij", _interpolation(heights), planes)), rays)
+        return _points(np.linalg.inv(np.einsum("rk,kij->rij", _interpolation(heights), planes)), rays)
 
 
 def place_discs(body: Body, T_cam_body: Array) -> list[Disc]:
     """The roundels of a body at T_cam_body (4, 4), visible or not."""
     outer = body.diameter_m / 2
-    radii = (outer * body.surround_ratio, outer, outer * body.inner_ratio)
+    radii = (outer * body.card_ratio, outer, outer * body.inner_ratio)
     points, normals, half = body.points, body.unit_normals, thickness_of(body) / 2
+    numbers = body.codes
     if half:
         points = np.concatenate([points + half * normals, points - half * normals])
-        normals = np.concatenate([normals, -normals])
+        normals, numbers = np.concatenate([normals, -normals]), 2 * numbers
     T_body_disc = np.tile(np.eye(4), (len(points), 1, 1))
     T_body_disc[:, :3, :3], T_body_disc[:, :3, 3] = rotation_with_z(normals), points
-    return [Disc(T, radii) for T in T_cam_body @ T_body_disc]
+    return [Disc(T, radii, code) for T, code in zip(T_cam_body @ T_body_disc, numbers, strict=True)]
 
 
 def discs_while_read(
@@ -135,8 +145,8 @@ def _interpolation(heights: Array) -> Array:
     return np.vander(heights, len(NODES)) @ np.linalg.inv(np.vander(NODES))
 
 
-def _distances(to_plane: Array, rays: Picture) -> Picture:
-    """(h, w) distances from the centre, metres; each row's matrix (h, 3, 3) maps rays (x, y, 1) to (a, b, 1) s."""
+def _points(to_plane: Array, rays: Picture) -> Picture:
+    """(h, w, 2) points of the plane, metres; each row's matrix (h, 3, 3) maps rays (x, y, 1) to (a, b, 1) s."""
     M, (x, y) = to_plane.astype(np.float32)[:, :, :, None], cv2.split(rays)
     a, b, s = (M[:, k, 0] * x + M[:, k, 1] * y + M[:, k, 2] for k in range(3))
-    return np.asarray(cv2.magnitude(a, b) / np.abs(s), np.float32)
+    return np.asarray(np.stack([a / s, b / s], axis=-1), np.float32)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Grey
+from camera_node.geometry import codes
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 from camera_node.simulation.discs import Disc, RollingDisc, discs_while_read, place_discs
@@ -102,9 +103,12 @@ class ImageModel:
         # All sub-samples of a pixel have the time of its row.
         rows = np.arange(v0 - 1, v1 + 1).repeat(SUBSAMPLES)
         heights = self.camera.image_row(np.column_stack([rows, rows]))
-        radius = disc.intersect(np.asarray(fine, np.float32), heights)
         rim = SUBSAMPLES - 1
-        card, black, white = covered_shares(radius[rim:-rim, rim:-rim], disc.radii)
+        points = disc.intersect(np.asarray(fine, np.float32), heights)[rim:-rim, rim:-rim]
+        radius = np.asarray(cv2.magnitude(points[..., 0], points[..., 1]), np.float32)
+        card, black, white = covered_shares(radius, disc.radii)
+        if disc.code:
+            black = black + _code_share(disc, points, radius)
         layers = cv2.merge([card, WHITE * card - (WHITE - BLACK) * (black - white)])
         blurred = cv2.GaussianBlur(
             layers, (0, 0), self.camera.blur_px * SUBSAMPLES, borderType=cv2.BORDER_CONSTANT
@@ -167,6 +171,18 @@ def covered_shares(radius: Picture, radii: tuple[float, ...]) -> list[Picture]:
     cell = cv2.max(across, down) / 2 + np.float32(1e-9)
     middle = radius[1:-1, 1:-1]
     return [(0.5 + (np.float32(r) - middle) / cell).clip(0, 1) for r in radii]
+
+
+def _code_share(disc: Disc | RollingDisc, points: Picture, radius: Picture) -> Picture:
+    """The share of each cell (h, w) that black sectors of a disc's code cover; arguments as of `covered_shares`."""
+    outer = disc.radii[1]
+    inside, around = covered_shares(radius, (codes.INNER * outer, codes.OUTER * outer))
+    x, y = cv2.split(points[1:-1, 1:-1])
+    across = cv2.absdiff(radius[1:-1, 2:], radius[1:-1, :-2])
+    down = cv2.absdiff(radius[2:, 1:-1], radius[:-2, 1:-1])
+    width = cv2.magnitude(across, down) / 2 / np.maximum(radius[1:-1, 1:-1], codes.INNER * outer)
+    black = codes.black_share(disc.code, np.arctan2(y, x), width)
+    return np.asarray((around - inside) * black, np.float32)
 
 
 def map_rays(lens: Lens, margin: int) -> Picture:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from camera_node.foundation.arrays import Array
+from camera_node.geometry import codes
 from camera_node.geometry.lens import Lens
 
 
@@ -26,6 +27,8 @@ class Sight:
         tilt: between the printed side's normal and the line of sight, radians; `turn` its direction.
         dark, bright, ground: grey levels; the ground surrounds the card.
         blur: standard deviation of the lens's Gaussian point spread, pixels, without the pixel's own width.
+        code: number of the code around the disc, 0 for none, whose zero is at `spin` radians from the direction of the
+            image's rows, counter-clockwise as seen in front of the print; `ring` has the radii of the code.
         bend: height of the middle of the card above its two ends, over the card's diameter: paper on a cylinder.
     """
 
@@ -42,6 +45,9 @@ class Sight:
     ground: float = 90.0
     blur: float = 0.7
     bend: float = 0.0
+    code: int = 0
+    spin: float = 0.0
+    ring: tuple[float, float] = (codes.INNER, codes.OUTER)
 
     @property
     def position(self) -> Array:
@@ -79,8 +85,11 @@ def pixels_across(lens: Lens, diameter_m: float, px: float) -> float:
 def trace(sight: Sight, pieces: int = 6) -> Array:
     """Grey levels (h, w) of the image of `sight.lens`, without noise, from `pieces` squared samples per pixel."""
     margin = int(np.ceil(4 * sight.blur)) + 1
-    radius = _trace_radius(sight, margin, pieces)
+    points = _trace_points(sight, margin, pieces)
+    radius = np.hypot(points[..., 0], points[..., 1])
     card, black, white = (_part(radius, r) for r in (sight.card, 1.0, sight.ratio))
+    if sight.code:
+        black = black + _code(sight, points, radius)
     fine = sight.ground + (sight.bright - sight.ground) * card - (sight.bright - sight.dark) * (black - white)
     if sight.blur:
         fine = cv2.GaussianBlur(fine, (0, 0), sight.blur * pieces, borderType=cv2.BORDER_REPLICATE)
@@ -89,18 +98,34 @@ def trace(sight: Sight, pieces: int = 6) -> Array:
     return whole[margin : h - margin, margin : w - margin]
 
 
-def _trace_radius(sight: Sight, margin: int, pieces: int) -> Array:
-    """Distance from the disc's centre, in outer radii, at each sample, with one more sample on every side."""
+def _code(sight: Sight, points: Array, radius: Array) -> Array:
+    """The coverage of each sample by the black sectors of the code."""
+    inner, outer = sight.ring
+    ring = _part(radius, outer) - _part(radius, inner)
+    angle = np.arctan2(points[1:-1, 1:-1, 1], points[1:-1, 1:-1, 0]) - sight.spin
+    cell = np.abs(radius[1:-1, 2:] - radius[1:-1, :-2]), np.abs(radius[2:, 1:-1] - radius[:-2, 1:-1])
+    return ring * codes.black_share(
+        sight.code, angle, np.hypot(*cell) / 2 / np.maximum(radius[1:-1, 1:-1], 0.1)
+    )
+
+
+def _trace_points(sight: Sight, margin: int, pieces: int) -> Array:
+    """(h, w, 2) points of the print, in outer radii, at each sample, with one more sample on every side.
+
+    The first axis is the direction of the image's rows in the print's plane, the second one is a quarter turn from it,
+    counter-clockwise as seen in front of the print. Bent paper is taken from above.
+    """
     lens = sight.lens
     u, v = (_pieces(n, margin, pieces) for n in (lens.width, lens.height))
     if lens.distortion:
         xy = lens.normalise(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)).reshape(len(v), len(u), 2)
     else:
         xy = np.stack(np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy), -1)
-    c = sight.position
-    depth = _depth(xy, sight)
-    squared = (depth * xy[..., 0] - c[0]) ** 2 + (depth * xy[..., 1] - c[1]) ** 2 + (depth - c[2]) ** 2
-    return np.sqrt(squared) / (sight.diameter_m / 2)
+    n, c = sight.normal, sight.position
+    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
+    axes = np.array([first, np.cross(n, first)]) / np.linalg.norm(first)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2)
+    return np.asarray((_depth(xy, sight)[..., None] * rays - c) @ axes.T, float) / (sight.diameter_m / 2)
 
 
 def _depth(xy: Array, sight: Sight) -> Array:

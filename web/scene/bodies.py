@@ -36,7 +36,7 @@ def enclosing_part(body: Body | None) -> Part:
     """
     if body is None:
         return Part(False, np.zeros(3), np.eye(3), np.array([UNKNOWN_RADIUS_M, UNKNOWN_RADIUS_M, PLATE_M]))
-    card_m = body.surround_ratio * body.diameter_m / 2
+    card_m = body.card_ratio * body.diameter_m / 2
     R = _axes(body.unit_normals)
     points, normals = body.points @ R, body.unit_normals @ R
     if len(sides(body)) == 1:

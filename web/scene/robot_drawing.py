@@ -144,7 +144,7 @@ class Prints:
         rings = np.zeros((len(of), 3), np.uint8)
         cards = np.full_like(rings, CARD_UNSEEN)
         self.layers[0].create(
-            rows, [_disc(body, k, body.surround_ratio, CARD_ABOVE_M) for _, body, k in of], cards
+            rows, [_disc(body, k, body.card_ratio, CARD_ABOVE_M) for _, body, k in of], cards
         )
         self.layers[1].create(rows, [_disc(body, k, 1.0, RING_ABOVE_M) for _, body, k in of], rings)
 

@@ -39,13 +39,19 @@ def flat(size: tuple[int, int], level: float) -> Array:
 
 @dataclass(frozen=True)
 class Card:
-    """A card to render: its disc's centre and frontal diameter in pixels, its orientation, and the print's ratio."""
+    """A card to render: its disc's centre and frontal diameter in pixels, its orientation, the print's ratio and code.
+
+    `card`, `code` and `spin` are those of `Sight`.
+    """
 
     uv: tuple[float, float]
     diameter: float
     tilt: float = 0.0
     turn: float = 0.0
     ratio: float = 0.6
+    card: float = 9 / 7
+    code: int = 0
+    spin: float = 0.0
 
 
 def paste(
@@ -74,7 +80,8 @@ def sight_of(card: Card, size: tuple[int, int], focal: float = F) -> Sight:
     w, h = size
     lens = Lens(width=w, height=h, fx=focal, fy=focal, cx=(w - 1) / 2, cy=(h - 1) / 2)
     distance = pixels_across(lens, 0.1, card.diameter)
-    return Sight(lens, card.uv, distance, tilt=card.tilt, turn=card.turn, ground=0.0, ratio=card.ratio)
+    of_print = {name: getattr(card, name) for name in ("ratio", "card", "code", "spin")}
+    return Sight(lens, card.uv, distance, tilt=card.tilt, turn=card.turn, ground=0.0, **of_print)
 
 
 def _bound(sight: Sight, blur: float) -> tuple[int, int, int, int]:
@@ -91,7 +98,7 @@ def _layers(sight: Sight, box: tuple[int, int, int, int]) -> tuple[Array, Array]
     (u0, v0, u1, v1), lens, (u, v) = box, sight.lens, sight.uv
     moved = msgspec.structs.replace(lens, width=u1 - u0, height=v1 - v0, cx=lens.cx - u0, cy=lens.cy - v0)
     there = replace(sight, lens=moved, uv=(u - u0, v - v0))
-    return trace(there, PIECES), trace(replace(there, dark=1.0, bright=1.0), PIECES)
+    return trace(there, PIECES), trace(replace(there, dark=1.0, bright=1.0, code=0), PIECES)
 
 
 def grid(count: int, size: tuple[int, int], rng: np.random.Generator) -> list[tuple[float, float]]:

@@ -15,6 +15,7 @@ from camera_node.commands.print import DIAMETER_M, Sheet
 from camera_node.detection.detector import Detector
 from camera_node.foundation.config import example_file, load_yaml
 from camera_node.foundation.errors import ConfigError
+from camera_node.geometry import codes
 from camera_node.geometry.body import Body
 from camera_node.sources.recorded_frames import read_grey
 from fusion.model.robots import load_robots
@@ -107,6 +108,27 @@ def test_roundels_have_the_requested_size(tmp_path: Path, paper: str, diameter: 
     assert len(centres) > 1
     assert np.abs(axes - 1e3 * diameter).max() < TOLERANCE_MM
     assert np.abs(ratios - 0.6).max() < 0.002
+
+
+def test_codes_are_printed_as_their_words_state(tmp_path: Path):
+    """The rings of a raster are black where the codes are, from the right on, counter-clockwise."""
+    (raster,) = rasterize(write(tmp_path, what="roundels", codes="3,60-61", diameter=0.04))
+    centres, _, _ = scan(raster, 40.0)
+    assert len(centres) == 3
+    angles = np.array([(k + 0.5) * codes.STEP for k in range(codes.SECTORS)])
+    ring = 20 * (codes.INNER + codes.OUTER) / 2 * np.column_stack([np.cos(angles), -np.sin(angles)])
+    for centre, code in zip(
+        centres[np.lexsort((centres[:, 0], centres[:, 1].round()))], (3, 60, 61), strict=True
+    ):
+        u, v = (np.rint((centre + ring) * PX_PER_MM - 0.5).astype(int)).T
+        due = codes.black_share(code, angles, np.full(len(angles), 1e-9)).round()
+        assert np.array_equal(raster[v, u] < 128, due == 1)
+
+
+@pytest.mark.parametrize("text", ["", "a", "1-2-3", "0", "98", "3-98"])
+def test_codes_that_do_not_exist_are_refused(tmp_path: Path, text: str):
+    with pytest.raises(ConfigError, match="--codes"):
+        write(tmp_path, what="roundels", codes=text)
 
 
 def test_a_robot_is_printed_as_its_yaml_declares_it(tmp_path: Path):

@@ -12,7 +12,7 @@ CAMERA_NODE, FUSION = ROOT / "camera_node" / "native", ROOT / "fusion" / "native
 LAYERS = (
     ("numeric",),
     ("fit", "lens"),
-    ("search", "verify"),
+    ("search", "verify", "code"),
     ("blur", "reference"),
     (".",),
 )  # the lowest first
