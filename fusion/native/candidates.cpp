@@ -60,6 +60,9 @@ struct ExpectedView {
     double vy;  // of the image, 1/s
 };
 
+double norm(const Vector& v) { return std::sqrt(dot(v, v)); }
+double trace(const Matrix& A) { return A.r0.x + A.r1.y + A.r2.z; }
+
 /// The detections of one frame, sorted by x for range queries.
 class FrameDetections {
   public:
@@ -72,8 +75,32 @@ class FrameDetections {
             max_xx_ = std::max(max_xx_, noise.xx);
             max_yy_ = std::max(max_yy_, noise.yy);
             max_delay_ = std::max(max_delay_, std::abs(detections.delay[k]));
+            low_y_ = std::min(low_y_, detections.xy.at(1, k));
+            high_y_ = std::max(high_y_, detections.xy.at(1, k));
         }
         std::sort(sorted_.begin(), sorted_.end(), [](const auto& a, const auto& b) { return a.x < b.x; });
+    }
+    /// Whether no marker of a group can have a detection in its gate.
+    ///
+    /// A gate is S sqrt(1 + x^2)/z wide beside noise, where S is the displacement of a marker by its position
+    /// and time errors. So a marker at x > X is outside that of X if (z - S)(x - X) > S sqrt(1 + X^2), since
+    /// sqrt(1 + x^2) < sqrt(1 + X^2) + x - X; for z > 2 S it suffices that z (x - X) > 2 S sqrt(1 + X^2).
+    bool excludes(const ExpectedMarkers::Group& group, const Body& body, const Exposure& exposure) const {
+        if (sorted_.empty()) return true;
+        const double tau = exposure.tau, gate = std::sqrt(kGate);
+        const Vector c = exposure.R_cam_world * (body.p + tau * body.v - exposure.centre);
+        if (c.z + group.radius <= 0) return true;
+        const double speed = norm(body.v) + norm(body.omega) * group.radius;
+        const double variance = group.at + std::abs(tau) * group.rate + tau * tau * group.drift;
+        const double S = gate * std::sqrt(variance) + (max_delay_ + gate * exposure.tau_sigma) * speed;
+        if (!(c.z - group.radius > 2 * S)) return false;
+        const double reach = group.radius + 2 * S, noise_x = gate * std::sqrt(max_xx_),
+                     noise_y = gate * std::sqrt(max_yy_);
+        const auto is_beyond = [&](double along, double bound) {
+            return along - bound * c.z > reach * std::sqrt(1 + bound * bound);
+        };
+        return is_beyond(c.x, sorted_.back().x + noise_x) || is_beyond(-c.x, noise_x - sorted_.front().x) ||
+               is_beyond(c.y, high_y_ + noise_y) || is_beyond(-c.y, noise_y - low_y_);
     }
     /// Calls `visit` for a superset of the detections within the gate of a moving point.
     template <class Visit>
@@ -91,7 +118,7 @@ class FrameDetections {
 
   private:
     std::vector<Detection> sorted_;
-    double max_xx_ = 0, max_yy_ = 0, max_delay_ = 0;
+    double max_xx_ = 0, max_yy_ = 0, max_delay_ = 0, low_y_ = kInfinity, high_y_ = -kInfinity;
 };
 
 double square(double x) { return x * x; }
@@ -146,21 +173,38 @@ ExpectedMarker ExpectedMarker::of(int64_t body, const DiscOnBody& disc, const Ma
             cross_covariance(P, by_rates, by_rates)};
 }
 
-std::vector<Candidate> find_candidates(const FramePoses& poses, const std::vector<ExpectedMarker>& markers,
+ExpectedMarkers::ExpectedMarkers(std::vector<ExpectedMarker> markers) : markers_(std::move(markers)) {
+    for (size_t m = 0; m < markers_.size(); ++m) {
+        const ExpectedMarker& marker = markers_[m];
+        if (groups_.empty() || groups_.back().body != marker.body)
+            groups_.push_back({marker.body, m, m, 0, 0, 0, 0});
+        Group& group = groups_.back();
+        group.last = m + 1;
+        group.radius = std::max(group.radius, norm(marker.disc.position) + marker.disc.radius);
+        group.at = std::max(group.at, trace(marker.at));
+        group.rate = std::max(group.rate, std::abs(trace(marker.rate)));
+        group.drift = std::max(group.drift, trace(marker.drift));
+    }
+}
+
+std::vector<Candidate> find_candidates(const FramePoses& poses, const ExpectedMarkers& markers,
                                        const Detections& detections, const double* focal) {
     std::vector<Candidate> found;
     size_t first = 0, last = 0;
     for (size_t f = 0; f < poses.exposures().size(); ++f, first = last) {
+        const Exposure& exposure = poses.exposures()[f];
         while (last < detections.size() && size_t(detections.frame[last]) == f) ++last;
         const FrameDetections of_frame(detections, first, last);
-        for (size_t m = 0; m < markers.size(); ++m) {
-            const ExpectedView expected =
-                expect(markers[m], poses.at(f, markers[m].body), poses.exposures()[f]);
-            if (!(expected.at.facing() > kGrazing) || !std::isfinite(expected.at.x)) continue;
-            of_frame.visit_near(expected, [&](const Detection& d) {
-                const double value = cost(expected, d, detections, focal[f]);
-                if (std::isfinite(value)) found.push_back({int64_t(m), d.index, value});
-            });
+        for (const ExpectedMarkers::Group& group : markers.groups()) {
+            if (of_frame.excludes(group, poses.bodies()[group.body], exposure)) continue;
+            for (size_t m = group.first; m < group.last; ++m) {
+                const ExpectedView expected = expect(markers.all()[m], poses.at(f, group.body), exposure);
+                if (!(expected.at.facing() > kGrazing) || !std::isfinite(expected.at.x)) continue;
+                of_frame.visit_near(expected, [&](const Detection& d) {
+                    const double value = cost(expected, d, detections, focal[f]);
+                    if (std::isfinite(value)) found.push_back({int64_t(m), d.index, value});
+                });
+            }
         }
     }
     return found;

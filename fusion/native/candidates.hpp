@@ -18,6 +18,26 @@ struct ExpectedMarker {
     Matrix covariance(double tau) const { return at + tau * rate + (tau * tau) * drift; }
 };
 
+/// Markers, and the bounds of each group of successive markers of one body.
+class ExpectedMarkers {
+  public:
+    /// A sphere around the origin of the body contains its discs; the variance of their positions in any
+    /// direction is at + |tau| rate + tau^2 drift at most.
+    struct Group {
+        int64_t body;
+        size_t first, last;
+        double radius, at, rate, drift;
+    };
+
+    explicit ExpectedMarkers(std::vector<ExpectedMarker> markers);
+    const std::vector<ExpectedMarker>& all() const { return markers_; }
+    const std::vector<Group>& groups() const { return groups_; }
+
+  private:
+    std::vector<ExpectedMarker> markers_;
+    std::vector<Group> groups_;
+};
+
 /// N detections sorted by frame: undistorted centres, Jacobians of raw pixels with respect to them, pixel
 /// covariances, full major axes (NaN where unknown), and the times from the frame to the capture of the
 /// detection's row by a rolling shutter, seconds.
@@ -39,7 +59,7 @@ struct Candidate {
 
 /// Finds the candidates of all markers that face their camera. `focal` is the focal length of each frame's
 /// camera in pixels.
-std::vector<Candidate> find_candidates(const FramePoses& poses, const std::vector<ExpectedMarker>& markers,
+std::vector<Candidate> find_candidates(const FramePoses& poses, const ExpectedMarkers& markers,
                                        const Detections& detections, const double* focal);
 
 }  // namespace roundel::fusion

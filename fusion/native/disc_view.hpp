@@ -58,6 +58,7 @@ class FramePoses {
     FramePoses(const std::vector<Body>& bodies, const std::vector<Exposure>& exposures);
 
     size_t n_bodies() const { return n_bodies_; }
+    const std::vector<Body>& bodies() const { return bodies_; }
     const std::vector<Exposure>& exposures() const { return exposures_; }
     const BodyInCamera& at(size_t frame, size_t body) const {
         const size_t k = frame * n_bodies_ + body;

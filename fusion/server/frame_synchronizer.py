@@ -2,7 +2,7 @@
 """Gathers the frames of free-running cameras into frame sets. Time comes from the data and the caller, not a clock."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -37,6 +37,10 @@ class _CameraRate:
         steps = sorted(b - a for a, b in pairwise(self.times))
         self.interval_ns = steps[(len(steps) - 1) // 2] if len(steps) > 1 else 0  # one step may be a pause
 
+    def is_missing(self, end_ns: int) -> bool:
+        """Whether a frame is expected before `end_ns`, at the camera's rate, that has not come."""
+        return bool(self.times) and self.times[-1] + INTERVAL_SLACK * self.interval_ns < end_ns
+
 
 class FrameSynchronizer:
     """Closes a frame set when every live camera has delivered its frame, or when the wait limit is reached.
@@ -59,6 +63,8 @@ class FrameSynchronizer:
         self._waiting: list[CalibratedFrame] = []
         self._end_ns: int | None = None  # of the open frame set; None while there is none
         self._newest_ns = 0
+        self._missing: dict[str, _CameraRate] = {}  # live ones and silent ones, of the set that ends at
+        self._missing_end_ns = 0
 
     @classmethod
     def at_rate(cls, rate_hz: float | None, lateness_ms: float) -> "FrameSynchronizer":
@@ -83,6 +89,7 @@ class FrameSynchronizer:
             return False
         if not camera.times or frame.t_ns > camera.times[-1]:
             camera.add(frame.t_ns)
+            self._note(frame.camera, camera)
         self._waiting.append(frame)
         self._newest_ns = max(self._newest_ns, frame.t_ns)
         return True
@@ -95,6 +102,7 @@ class FrameSynchronizer:
         """Wait no longer for the frames of a camera, until one is added again."""
         if name in self._cameras:
             self._cameras[name].times.clear()
+            self._note(name, self._cameras[name])
 
     def take(self, now_ns: int) -> list[FrameSet]:
         """The frame sets that are closed at `now_ns`: a server's time, or offline the newest capture time."""
@@ -107,7 +115,7 @@ class FrameSynchronizer:
         if self._end_ns is None or not self.period_ns or not self._waiting:
             return None, 0
         opened = self._gather(self._end_ns, self.period_ns)
-        return (opened if opened.frames else None), self._count_missing(self._end_ns)
+        return (opened if opened.frames else None), sum(self._missing_cameras(self._end_ns))
 
     def finish(self) -> list[FrameSet]:
         """The frame sets of all remaining frames, at the end of a recording."""
@@ -142,13 +150,14 @@ class FrameSynchronizer:
         end_ns = middle_ns + self.period_ns // 2
         self._end_ns = end_ns - (end_ns - first_ns - 1) // self.period_ns * self.period_ns
 
-    def _live_cameras(self) -> list[_CameraRate]:
-        oldest_ns = self._newest_ns - SILENT_NS
-        return [c for c in self._cameras.values() if c.times and c.times[-1] > oldest_ns]
+    def _is_live(self, camera: _CameraRate) -> bool:
+        return bool(camera.times) and camera.times[-1] > self._newest_ns - SILENT_NS
 
     def _fastest_interval_ns(self) -> int:
         """The interval of the fastest live camera that is not far faster than the median one, 0 if none is known."""
-        intervals = sorted(c.interval_ns for c in self._live_cameras() if c.interval_ns > 0)
+        intervals = sorted(
+            c.interval_ns for c in self._cameras.values() if c.interval_ns > 0 and self._is_live(c)
+        )
         if not intervals:
             return 0
         usual_ns = intervals[len(intervals) // 2]  # the slower one of two in the middle
@@ -189,9 +198,19 @@ class FrameSynchronizer:
     def _is_due(self, end_ns: int, now_ns: int) -> bool:
         """Whether the wait limit is reached, or all live cameras have delivered to a set that has begun."""
         has_begun = self.period_ns is not None and now_ns >= end_ns - self.period_ns
-        is_complete = has_begun and bool(self._live_cameras()) and not self._count_missing(end_ns)
-        return is_complete or now_ns >= end_ns + self.lateness_ns
+        is_complete = has_begun and any(self._is_live(c) for c in self._cameras.values())
+        return (is_complete and not any(self._missing_cameras(end_ns))) or now_ns >= end_ns + self.lateness_ns
 
-    def _count_missing(self, end_ns: int) -> int:
-        """How many live cameras have not delivered a frame that is expected, at their rates, before `end_ns`."""
-        return sum(c.times[-1] + INTERVAL_SLACK * c.interval_ns < end_ns for c in self._live_cameras())
+    def _note(self, name: str, camera: _CameraRate) -> None:
+        """Whether a camera is missing in the open set, after its times changed."""
+        if camera.is_missing(self._missing_end_ns):
+            self._missing[name] = camera
+        else:
+            self._missing.pop(name, None)
+
+    def _missing_cameras(self, end_ns: int) -> Iterator[bool]:
+        """True for each live camera that has not delivered a frame that is expected before `end_ns`."""
+        if end_ns != self._missing_end_ns:
+            self._missing_end_ns = end_ns
+            self._missing = {name: c for name, c in self._cameras.items() if c.is_missing(end_ns)}
+        return (True for camera in self._missing.values() if self._is_live(camera))

@@ -61,12 +61,15 @@ class Acquisition:
         cameras: cameras of the rig.
         estimator: of all robots.
         leads: whether this shard reports the unlabeled markers, and so needs them in every frame set.
+
+    Attributes:
+        search: finds markers among unassigned detections.
     """
 
     def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
         self._cameras, self._estimator, self._leads = cameras, estimator, leads
         self._turn = 0  # row of the first constellation to search for, if there are too many
-        self._markers, self._weak = MarkerSearch(cameras, leads), WeakFits()
+        self.search, self._weak = MarkerSearch(cameras, leads), WeakFits()
 
     def acquire(
         self,
@@ -92,22 +95,23 @@ class Acquisition:
         is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))
         of_singles, of_bodies = assignments.select(is_single), assignments.select(~is_single)
         n_missing = int(np.isin(table.markers.robot, missing).sum())
-        markers, crowded = self._markers.find(table.markers, n_missing, detections, of_bodies)
+        markers, crowded = self.search.find(table.markers, n_missing, detections, of_bodies)
         found, reasons = self._acquire_bodies(table, bodies, markers, detections, of_bodies)
         of_bodies = of_bodies.joined(*(fits.assignments for fits in found))
         displaced = np.unique(of_singles.marker[np.isin(of_singles.detection, of_bodies.detection)])
         assignments = of_bodies.joined(of_singles.select(~np.isin(of_singles.marker, displaced)))
         markers = _without(markers, assignments)
         choice = choose_markers(table, singles, markers, histories)
-        more = self._acquire_singles(table, choice, markers, detections)
-        none = table.states.select(missing[:0])
-        states = none.joined(*(fits.states for fits in found), more.states)
+        if choice.pairs:
+            more = self._acquire_singles(table, choice, markers, detections)
+            found, markers = [*found, more], _without(markers, more.assignments)
+            assignments = assignments.joined(more.assignments)
         return Acquired(
-            np.concatenate([*(fits.robot for fits in found), more.robot]),
-            states,
+            np.concatenate([missing[:0], *(fits.robot for fits in found)]),
+            table.states.select(missing[:0]).joined(*(fits.states for fits in found)),
             table.markers.robot[displaced],
-            assignments.joined(more.assignments),
-            _without(markers, more.assignments),
+            assignments,
+            markers,
             reasons | choice.reasons,
             crowded,
         )
@@ -137,7 +141,7 @@ class Acquisition:
         self._turn = identified.turn
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
-        n_frame_sets, t_ns = self._markers.n_frame_sets, table.t_ns or 0
+        n_frame_sets, t_ns = self.search.n_frame_sets, table.t_ns or 0
         confirmed = self._weak.confirm(identified.weak, t_ns, n_frame_sets)
         found = [fits.select(table.owned[fits.robot]) for fits in (*identified.fits, *confirmed)]
         acquired = {k for fits in found for k in fits.robot.tolist()}

@@ -285,7 +285,8 @@ MAX_PAIRS = 80_000
 # The same of detections that no declared size explains, above which other sizes are not searched for: a new robot is
 # defined where little else is unassigned, and poses must not wait for it. That is 25 in each frame of 8 cameras.
 MAX_OTHER_PAIRS = 20_000
-OTHERS_EVERY = 8  # frame sets from one search for other sizes to the next, while none is found
+# Frame sets from one search to the next, while none is found: for other sizes, and where no robot is missing.
+OTHERS_EVERY = 8
 
 
 class MarkerSearch:
@@ -297,12 +298,15 @@ class MarkerSearch:
 
     Attributes:
         n_frame_sets: with unassigned detections, so far.
+        is_due: whether unassigned detections stay, so that a search is worth its time also where no robot is missing.
     """
 
     def __init__(self, cameras: CameraArray, leads: bool) -> None:
         self._cameras, self._leads = cameras, leads
         self.n_frame_sets = 0
         self._has_others = False  # whether the last search for other sizes found markers
+        self._has_found = True  # whether the last search found markers
+        self.is_due = False
 
     def find(
         self, declared: MarkerTable, n_missing: int, detections: DetectionTable, assignments: Assignments
@@ -324,6 +328,8 @@ class MarkerSearch:
         if not free.any():
             return [], free.nonzero()[0][:0]
         self.n_frame_sets += 1
+        if not (n_missing or self._has_found or self.is_due) and self.n_frame_sets % OTHERS_EVERY:
+            return [], free.nonzero()[0][:0]
         limit = n_missing + limit_of(len(detections.exposures.camera), MAX_PAIRS)
         portion = Portion(limit, self.n_frame_sets, float(np.median(diameters)))
         rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
@@ -332,6 +338,7 @@ class MarkerSearch:
             others = self._find_other_sizes(detections, rows, markers, diameters)
             self._has_others = len(others) > 0
             markers += others
+        self._has_found = bool(markers)
         return markers, crowded
 
     def _find_other_sizes(

@@ -289,6 +289,7 @@ class Tracker:
             return seen
         used = np.concatenate([update.assignments.detection, seen.detections])
         rows = self.single_view.confirm(update.t_ns, update.detections, used)
+        self.acquisition.search.is_due = len(rows) > 0
         if not len(rows):
             return seen
         positions, covariances = self.table.alive_markers()

@@ -57,6 +57,7 @@ class ArrivalMonitor:
         self.jumped: frozenset[str] = frozenset()
         self.undecided: frozenset[str] = frozenset()  # cameras that may have jumped, unlike most others
         self.impossible_ns = 0.0  # a change that all cameras shared with the last frame, into the future
+        self._is_open = False  # whether a camera has changed or may have
 
     def observe(self, name: str, t_ns: int, received_ns: int) -> None:
         """Take the stamp and the arrival of the next frame of a camera; `jumped`, `undecided` and `impossible_ns`
@@ -66,12 +67,10 @@ class ArrivalMonitor:
         change_ns = camera.change_ns
         if camera.check.has_jumped(t_ns, received_ns):
             camera.earlier_ns, camera.has_changed = change_ns, True
-        elif (
-            not any(c.has_changed or c.check.is_undecided for c in self._cameras.values())
-            and not self.undecided
-        ):
+        elif not (self._is_open or camera.check.is_undecided):
             return
         self._compare(received_ns)
+        self._note_open()
 
     def jump_ns(self, name: str) -> float | None:
         """By how much the stamps of a camera jumped relative to the others; None if arrivals do not show it."""
@@ -96,6 +95,7 @@ class ArrivalMonitor:
         self.jumped -= {name}
         if self._shared:
             self._shared.add(name)
+        self._note_open()
 
     def reset(self, name: str) -> None:
         """Forget a camera."""
@@ -103,6 +103,11 @@ class ArrivalMonitor:
         self.jumped -= {name}
         self._shared -= {name}
         self.undecided -= {name}
+        self._note_open()
+
+    def _note_open(self) -> None:
+        cameras = self._cameras.values()
+        self._is_open = bool(self.undecided) or any(c.has_changed or c.check.is_undecided for c in cameras)
 
     def _shared_ns(self) -> float:
         changes = [self._cameras[name].change_ns for name in self._shared]

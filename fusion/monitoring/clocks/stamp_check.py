@@ -2,10 +2,10 @@
 """Compares the stamps of a camera with the arrival of its frames: evidence of a jump in its first frame."""
 
 from collections import deque
+from statistics import median
 
 import numpy as np
 
-from camera_node.foundation.arrays import Array
 from fusion.monitoring.clocks.undecided_jump import (
     MAX_SWAPPED,
     MIN_IRREGULAR,
@@ -38,7 +38,7 @@ class StampCheck:
         self.tolerance_ns = 0.0  # of the size of the last jump
         self._lags: deque[int] = deque(maxlen=HISTORY)
         self._stamps: deque[int] = deque(maxlen=LEARNED)
-        self._quantiles, self._slope, self._age = np.zeros(3), 0.0, RENEWED
+        self._quantiles, self._slope, self._age = (0.0, 0.0, 0.0), 0.0, RENEWED
         self._interval_ns = 1.0  # between stamps
 
     def has_jumped(self, t_ns: int, received_ns: int) -> bool:
@@ -130,19 +130,20 @@ class StampCheck:
         self._stamps.clear()
         self._undecided, self._age = None, RENEWED
 
-    def _expected_lags(self) -> Array:
-        """(3,) quantiles 0, 0.5 and 1 of the lag of the next frame: the lags so far follow their trend, as those
+    def _expected_lags(self) -> tuple[float, float, float]:
+        """The quantiles 0, 0.5 and 1 of the lag of the next frame: the lags so far follow their trend, as those
         of a clock that drifts do."""
         self._age += 1
         if self._age > RENEWED:
             self._interval_ns = usual_interval(self._stamps)
-            lags = np.array(self._lags, float)
-            half = len(lags) // 2
-            slope = float(np.median(lags[half:]) - np.median(lags[:half])) / (len(lags) / 2)
+            lags, n = list(self._lags), len(self._lags)
+            slope = (median(lags[n // 2 :]) - median(lags[: n // 2])) / (n / 2)
             self._slope = slope if abs(slope) < MAX_RATE * self._interval_ns else 0.0
-            lags += self._slope * np.arange(len(lags), 0, -1)
-            self._quantiles, self._age = np.percentile(lags, [0, 50, 100]), 0
-        return self._quantiles + self._slope * self._age
+            now = sorted(lag + self._slope * (n - k) for k, lag in enumerate(lags))
+            self._quantiles, self._age = (now[0], median(now), now[-1]), 0
+        first, usual, last = self._quantiles
+        since = self._slope * self._age
+        return first + since, usual + since, last + since
 
     def _is_irregular(self, t_ns: int) -> bool:
         """Whether the time since the last stamp is no multiple of the usual interval, nor that of a swapped frame."""

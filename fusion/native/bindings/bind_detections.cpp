@@ -8,8 +8,6 @@
 namespace roundel::fusion {
 namespace {
 
-using Markers = std::vector<ExpectedMarker>;
-
 /// The arrays of N detections, sorted by frame.
 struct DetectionColumns {
     Index frame;
@@ -31,34 +29,34 @@ struct DetectionColumns {
 };
 
 /// R and P are by body; `body`, `position`, `normal` and `radius` are by marker.
-void make_expected(Markers* self, const Rotations& R, const Covariances& P, const Index& body,
+void make_expected(ExpectedMarkers* self, const Rotations& R, const Covariances& P, const Index& body,
                    const Vectors& position, const Vectors& normal, const Numbers& radius) {
     const size_t n = body.size();
     require_equal(R.shape(0), {P.shape(0)});
     require_equal(n, {radius.size()});
     below(R.shape(0), body);
     const auto positions = columns<3>(position, n), normals = columns<3>(normal, n);
-    Markers markers;
+    std::vector<ExpectedMarker> markers;
     for (size_t k = 0; k < n; ++k)
         markers.push_back(ExpectedMarker::of(body(k), {positions.vector(k), normals.vector(k), radius(k)},
                                              matrix_at(R.data() + 9 * body(k)), P.data() + 144 * body(k)));
-    new (self) Markers(std::move(markers));
+    new (self) ExpectedMarkers(std::move(markers));
 }
 
-Out covariances(const Markers& markers, double tau) {
-    auto [all, to] = make({markers.size(), 3, 3});
-    for (const ExpectedMarker& marker : markers) {
+Out covariances(const ExpectedMarkers& markers, double tau) {
+    auto [all, to] = make({markers.all().size(), 3, 3});
+    for (const ExpectedMarker& marker : markers.all()) {
         write(marker.covariance(tau), to);
         to += 9;
     }
     return all;
 }
 
-auto candidates(const Markers& markers, const FramePoses& poses, const DetectionColumns& detections,
+auto candidates(const ExpectedMarkers& markers, const FramePoses& poses, const DetectionColumns& detections,
                 const Numbers& focal) {
     below(poses.exposures().size(), detections.frame);
     require_equal(poses.exposures().size(), {focal.size()});
-    for (const ExpectedMarker& marker : markers) require_below(poses.n_bodies(), marker.body);
+    for (const auto& marker : markers.all()) require_below(poses.n_bodies(), marker.body);
     std::vector<Candidate> found;
     unlocked([&, all = detections.view()] { found = find_candidates(poses, markers, all, focal.data()); });
     auto [pairs, rows] = make<int64_t>({2, found.size()});
@@ -91,7 +89,7 @@ void bind_detections(nb::module_& m) {
     nb::class_<DetectionColumns>(m, "DetectionColumns")
         .def(nb::init<const Index&, const Pairs&, const Matrices2&, const Matrices2&, const Numbers&,
                       const Numbers&>());
-    nb::class_<Markers>(m, "ExpectedMarkers")
+    nb::class_<ExpectedMarkers>(m, "ExpectedMarkers")
         .def("__init__", &make_expected)
         .def("covariances", &covariances)
         .def("candidates", &candidates);

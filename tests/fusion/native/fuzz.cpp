@@ -131,7 +131,7 @@ bool associate(Random& random, double wild) {
                   focal = random.numbers(frames, 800, wild), delay = random.numbers(n, 0.01, wild);
     const Detections seen{frame.data(),    {xy.data(), n}, {scale.data(), n},
                           {cov.data(), n}, major.data(),   delay.data()};
-    const std::vector<Candidate> pairs = find_candidates(poses, markers, seen, focal.data());
+    const std::vector<Candidate> pairs = find_candidates(poses, ExpectedMarkers(markers), seen, focal.data());
     std::vector<char> found(n * markers.size());
     for (const Candidate& pair : pairs) {
         char& before = found.at(size_t(pair.detection) * markers.size() + size_t(pair.marker));

@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Detections of several cameras as markers: points of unknown size in two views, and markers that move."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fusion.tracking.ray_pairs import _marginals
+from fusion.tracking.single_view import CONFIRMED
+from fusion.tracking.tracker import Tracker
+from tests.benchmarks.fusion_accuracy import frame_sets
 from tests.benchmarks.fusion_grouping import (
     FREE_RUNNING,
     SCENES,
@@ -15,6 +20,7 @@ from tests.benchmarks.fusion_grouping import (
     moving_score,
     score,
 )
+from tests.benchmarks.fusion_load import Load
 
 
 @pytest.mark.parametrize(
@@ -111,3 +117,22 @@ def test_rays_of_several_discs_that_motion_lets_meet_make_no_marker(apart_m: flo
     assert got.precision >= 0.99
     assert got.recall >= 0.95
     assert found_off == 4 * off
+
+
+def test_a_marker_that_appears_is_found_soon_although_no_robot_is_missing():
+    """Detections of one frame set are not searched without a cause; those that stay are one."""
+    load = Load(2, 4, 4, 30.0, missing=0.0, false=0.0)
+    both = zip(frame_sets(load, 1.2), frame_sets(replace(load, clutter=1), 1.2), strict=True)
+    tracker, found = Tracker(load.rig, load.bodies), []
+    for k, (without, with_marker) in enumerate(both):
+        tracker.acquisition.search.n_frame_sets *= (
+            k > 20
+        )  # the next search without a cause is eight frame sets later
+        markers = tracker.track(with_marker if k > 20 else without).markers
+        found.append(np.flatnonzero(np.frombuffer(markers.robot, "<i4") < 0))
+    assert tracker.table.tracked.all()
+    assert not any(map(len, found[15:21]))
+    seen = [len(rows) for rows in found[21:]]
+    first = seen.index(1)
+    assert first <= CONFIRMED + 1
+    assert set(seen[first:]) == {1}, "one marker, found by several cameras"
