@@ -15,11 +15,11 @@ from calib.errors import CalibrationError
 from calib.intrinsics.board import make_finder
 from calib.intrinsics.images import find_cameras, read_frames
 from calib.intrinsics.lens_calibration import BoardViews, CalibratedLens, Model, merge_lenses
-from calib.intrinsics.nominal_lens import with_nominal_lenses
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from calib.rig.wand_file import load_wand
 from calib.wand.calibrate import calibrate
+from calib.wand.nominal_lens import with_nominal_lenses
 from calib.wand.quality.agreement import Agreement, CameraPoses, compare_calibrations
 from calib.wand.quality.grade import RigQuality, assess
 from calib.wand.scale import SIGMA_M, Distance

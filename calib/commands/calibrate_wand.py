@@ -18,7 +18,6 @@ from calib.commands.inputs import WandOptions, require_positive
 from calib.commands.output import check_folder, conclude, provenance, put_in_force, write_rig
 from calib.commands.printed_report import print_recalibration, print_report, save_maps
 from calib.errors import CalibrationError
-from calib.intrinsics.nominal_lens import FIELD_OF_VIEW_DEG, load_known_lenses, with_nominal_lenses
 from calib.live.collect import CollectedFrames, running_camera_sizes
 from calib.live.live_session import SessionProgress, run_wand_session
 from calib.live.trials import MAX_SECONDS, WandSession
@@ -27,6 +26,7 @@ from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import load_wand
 from calib.wand.bundle_adjustment.covariance import widen_lenses
 from calib.wand.calibrate import calibrate
+from calib.wand.nominal_lens import FIELD_OF_VIEW_DEG, load_known_lenses, with_nominal_lenses
 from calib.wand.quality.grade import assess
 from calib.wand.scale import Distance
 from calib.wand.single_camera import recalibrate_camera

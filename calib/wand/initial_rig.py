@@ -151,6 +151,13 @@ class TwoViewGeometry:
             self._known[a, b] = self._estimate(a, b)
         return self._known[a, b]
 
+    def correspond(self, a: int, b: int) -> tuple[Array, Array]:
+        """Return image plane coordinates (n, 2) of the same markers in two cameras, at the clock shift that the data
+        show."""
+        rows = self._overlapping_rows(a, b)
+        matches = self._correspond(rows, b, self._find_shift(b, rows))
+        return matches.xy_a, matches.xy_b
+
     def _estimate(self, a: int, b: int) -> TwoView | None:
         pose, shift_s = self._estimate_with_shift(a, b)
         if pose is None:
@@ -173,10 +180,7 @@ class TwoViewGeometry:
     def _estimate_with_shift(self, a: int, b: int) -> tuple[_RelativePose | None, float]:
         """Return the relative pose up to scale and the clock shift, 0 unless the data show one."""
         rows = self._overlapping_rows(a, b)
-        if self.timing.synchronous:
-            return self._fit_pose(a, b, rows, 0.0), 0.0
-        selected = self.detections.select(rows)
-        shift_s = find_shift(self.tracks[b], selected, self.gap_s)
+        selected, shift_s = self.detections.select(rows), self._find_shift(b, rows)
         unshifted = self._fit_pose(a, b, rows, 0.0)
         shifted = self._fit_pose(a, b, rows, shift_s) if shift_s else None
         if shifted is None:
@@ -185,6 +189,11 @@ class TwoViewGeometry:
         if unshifted is not None and not supports_shift(unshifted.misfit, shifted.misfit, *counts):
             return unshifted, 0.0
         return shifted, shift_s
+
+    def _find_shift(self, b: int, rows: Index) -> float:
+        if self.timing.synchronous:
+            return 0.0
+        return find_shift(self.tracks[b], self.detections.select(rows), self.gap_s)
 
     def _overlapping_rows(self, a: int, b: int) -> Index:
         """Return rows of camera a at times when b has detections, clock shift apart.

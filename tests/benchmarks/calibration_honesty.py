@@ -2,12 +2,14 @@
 """Whether the wand calibration's covariances are true: `python -m tests.benchmarks.calibration honesty`.
 
 One cell is a kind of clocks, wand and lenses and a duration. The figure of a cell is the mean squared error in
-standard deviations over seeds, of poses, clocks and the scale: 1 for true covariances. "noise" is that of poses by the
-noise of the image alone, without the part of the covariance for lens errors that the recording cannot show.
+standard deviations over seeds, of poses, clocks, the scale and focal lengths: 1 for true covariances. "noise" is that
+of poses by the noise of the image alone, without the part of the covariance for lens errors that the recording cannot
+show.
 
 Lenses: "exact" ones are declared so by their files (`lens_sigma` 0), "calibrated" ones are off by what their files
 state, "rough" ones by 0.4 %, and of "unstated" ones, which are exact too, no file says so: there the covariance claims
-errors that do not exist (DECISIONS 18), so poses are below 1 and noise is not.
+errors that do not exist (DECISIONS 18), so poses are below 1 and noise is not. "unknown" ones start without distortion
+from focal lengths that are wrong by factors between 1/2 and 2, each camera's by another, as of image sizes alone.
 
 A figure outside of 0.6 to 1.6 is marked with "!", and with "?" if its standard error over seeds may explain it.
 Options: `--seeds N` (3), `--jobs N` processes (all processors), `--save FILE`: results are added to the file, and
@@ -32,10 +34,11 @@ from rich.console import Console
 from rich.table import Table
 
 from calib.errors import CalibrationError
-from calib.rig.camera import OFFSET, POSE
+from calib.rig.camera import LENS, OFFSET, POSE, lens_parameters
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate
+from calib.wand.nominal_lens import nominal_lens
 from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.terminal import track
@@ -57,6 +60,7 @@ LENSES: dict[str, Callable[[Rig, int], Rig]] = {
     "unstated": lambda rig, seed: rig,
     "calibrated": lambda rig, seed: roughly(rig, CAREFUL, with_sigma=True, seed=seed),
     "rough": lambda rig, seed: roughly(rig, OLD, seed=seed),
+    "unknown": lambda rig, seed: without_lenses(rig, seed),
 }
 SECONDS = (10, 30, 60)
 RATE_HZ, CAMERAS = 20.0, 4
@@ -72,10 +76,11 @@ class Outcome(msgspec.Struct, frozen=True):
     noise: float | None = None
     clocks: float | None = None
     scale: float | None = None
+    focal: float | None = None
     fault: str = ""
 
 
-FIGURES = ("poses", "noise", "clocks", "scale")
+FIGURES = ("poses", "noise", "clocks", "scale", "focal")
 
 
 def cells() -> dict[str, tuple[str, str, str, int]]:
@@ -111,7 +116,26 @@ def measure(name: str, seed: int) -> Outcome:
     squared, degrees = joint_error(result, recorded.truth)
     noise = joint_error(replace(result, covariance=noise_covariance(result)), recorded.truth)[0]
     clocks, scale = clock_error(result, recorded), scale_error(result, recorded.truth)
-    return Outcome(name, seed, squared / degrees, noise / degrees, clocks, scale)
+    focal = focal_error(result, recorded.truth)
+    return Outcome(name, seed, squared / degrees, noise / degrees, clocks, scale, focal)
+
+
+def without_lenses(rig: Rig, seed: int) -> Rig:
+    """The rig with nominal lenses, with focal lengths between half and twice the true ones."""
+    rng, cameras = np.random.default_rng([11, seed]), {}
+    for name, camera in rig.cameras.items():
+        focal = float(np.exp(np.log(camera.fx * camera.fy) / 2 + np.log(2) * rng.uniform(-1, 1)))
+        cameras[name] = nominal_lens(camera.width, camera.height, focal)
+    return Rig(cameras=cameras)
+
+
+def focal_error(result: WandCalibration, truth: Rig) -> float:
+    """Squared Mahalanobis error of the logarithms of all focal lengths, over their number."""
+    off = [
+        lens_parameters(result.rig.cameras[n])[0] - lens_parameters(truth.cameras[n])[0] for n in result.names
+    ]
+    covariance = camera_covariance(result.adjusted).of(LENS[:1])[:, 0, :, 0]
+    return float(np.array(off) @ np.linalg.solve(covariance, off)) / len(off)
 
 
 def noise_covariance(result: WandCalibration) -> Array:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import viser
 
-from calib.intrinsics.nominal_lens import load_known_lenses
 from calib.live.rig_requests import set_rig
 from calib.rig.rig import Rig, save_rig
 from calib.rig.rig_messages import RigHistory, RigVersion, holds_rig
+from calib.wand.nominal_lens import load_known_lenses
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import RoundelError, printable
 from camera_node.geometry.body import PrintedWand

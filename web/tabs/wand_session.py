@@ -11,13 +11,13 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from calib.intrinsics.nominal_lens import load_known_lenses, with_nominal_lenses
 from calib.live.collect import running_camera_sizes
 from calib.live.live_session import SessionProgress, run_wand_session
 from calib.live.trials import WandSession
 from calib.live.wand_position import locate_wand
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig, save_rig
+from calib.wand.nominal_lens import load_known_lenses, with_nominal_lenses
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import load_yaml
 from camera_node.geometry.body import Body, PrintedWand

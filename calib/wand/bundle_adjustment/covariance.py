@@ -34,6 +34,8 @@ MIN_BLOCKS = 4  # fewer do not show a correlation
 # calibration, and the true lens: log f, the principal point (share of the longer side), k1, log fx / fy, and the
 # distortion coefficients after k1.
 FOCAL, CENTRE, K1, RATIO, HIGHER = 0.03, 0.02, 0.1, 0.01, (0.1, 0.005, 0.005, 0.1)
+# Of log f of a lens of which only the image size is known: uniform between half and twice the guess.
+UNKNOWN_FOCAL = np.log(2) / np.sqrt(3)
 # Factors of these for a lens that the recording shows to be farther off: a file of another lens, or none.
 WIDER = np.array([15.0, 4.0, 4.0, 5.0, 4.0, 4.0, 2.0, 2.0, 4.0])
 CONTRADICTED = 1e-4  # probability below which the recording contradicts standard deviations of a lens
@@ -149,6 +151,13 @@ def usual_sigma(lens: Lens) -> Array:
     return np.array([FOCAL, CENTRE * size, CENTRE * size, K1, RATIO, *HIGHER])
 
 
+def unknown_sigma(lens: Lens) -> Array:
+    """(9,) standard deviations of the parameters of a lens that is known by its image size alone."""
+    sigma = usual_sigma(lens)
+    sigma[0] = UNKNOWN_FOCAL
+    return sigma
+
+
 def calibrated_sigma(lens: Lens) -> Array | None:
     """(9,) standard deviations of the parameters (`LENS`) from the lens's file; None where it has none.
 
@@ -162,7 +171,9 @@ def calibrated_sigma(lens: Lens) -> Array | None:
     focal = np.hypot(fx / lens.fx, fy / lens.fy) / np.sqrt(2)
     k1, *higher = distortion or [K1]
     higher = [*higher, 0.0, 0.0, 0.0, 0.0][:4]
-    return np.maximum([focal, cx, cy, k1, UNCOMMON * focal, *higher], MIN_SHARE * usual_sigma(lens))
+    return np.maximum(
+        [focal, cx, cy, k1, min(UNCOMMON * focal, RATIO), *higher], MIN_SHARE * usual_sigma(lens)
+    )
 
 
 def coarse_sigma(lens: Lens) -> Array:
@@ -263,7 +274,7 @@ def _choose_sigma(problem: Problem, information: Array, gradient: Array) -> tupl
     for k, lens in enumerate(lenses):
         block, given = covariance[size * k :, size * k :][:size, :size], calibrated_sigma(lens)
         if given is not None and _plausible(correction[k], block + np.diag(given**2)):
-            sigma[k], unknown[k] = given, False
+            sigma[k], unknown[k] = given, given >= usual_sigma(lens)
         elif not _plausible(correction[k], block + np.diag(sigma[k] ** 2)):
             sigma[k], unknown[k] = WIDER * sigma[k], False
     return sigma, unknown

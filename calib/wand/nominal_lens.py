@@ -1,25 +1,33 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Lenses of cameras that were never calibrated: a guess, from which the wand calibration finds the lens.
 
-The guess is a field of view of 60 degrees without distortion. Lenses from 50 to 70 degrees converge from it
-(`tests/calib/wand/test_nominal_lenses.py`); others, and every lens where millimetres count, need a board.
+The guess is a field of view of 60 degrees without distortion, and the focal length may be half or twice of it:
+`lens_sigma` says so. Lenses far beyond, fisheyes, and every lens where millimetres count need a board.
 """
 
 import math
 from collections.abc import Mapping
 from pathlib import Path
 
+import msgspec
+
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
+from calib.wand.bundle_adjustment.covariance import parameter_sigma, unknown_sigma
 
 FIELD_OF_VIEW_DEG = 60.0  # horizontal; most webcams and Pi cameras have 54 to 70
 
 
-def nominal_lens(width: int, height: int) -> Camera:
-    """A camera of this image size, pixels, with the nominal field of view."""
-    focal_px = width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG / 2))
+def nominal_lens(width: int, height: int, focal_px: float | None = None) -> Camera:
+    """A camera of this image size, pixels, with the standard deviations of a guess.
+
+    Args:
+        width, height: of its images.
+        focal_px: the guess; by default that of the nominal field of view.
+    """
+    focal_px = focal_px or width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG / 2))
     centre = (width - 1) / 2, (height - 1) / 2
-    return Camera(
+    guess = Camera(
         width=width,
         height=height,
         fx=focal_px,
@@ -28,6 +36,7 @@ def nominal_lens(width: int, height: int) -> Camera:
         cy=centre[1],
         distortion=(0.0,) * 5,
     )
+    return msgspec.structs.replace(guess, lens_sigma=parameter_sigma(guess, None, unknown_sigma(guess)))
 
 
 def with_nominal_lenses(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> tuple[Rig, list[str]]:

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Finds rough focal lengths of cameras whose lenses are unknown, before any pose: the adjustment starts from them.
+
+The fundamental matrix of two cameras has seven degrees of freedom, an essential matrix five, which leaves two equations
+for two focal lengths where the principal points are known (Hartley and Zisserman, section 19.3). They are degenerate
+where optical axes meet, as on a ring of cameras that look at its middle, so no pair is solved on its own. Each pair
+gives a table instead: for every two focal lengths of a grid, the least squares of the Sampson distances over all
+essential matrices. The sum of the tables and of the lenses' priors is the negative logarithm of the likelihood of all
+focal lengths. A grid has no local minimum that is missed, and where the sum is flat the priors decide.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import msgspec
+import numpy as np
+
+from calib.rig.rig import Rig
+from calib.wand.bundle_adjustment.covariance import FOCAL, calibrated_sigma
+from calib.wand.bundle_adjustment.problem_setup import MIN_SIGMA_PX
+from calib.wand.bundle_adjustment.residuals import CAUCHY_SCALE
+from calib.wand.initial_rig import GATE_PX, MIN_COMMON, TwoViewGeometry, sampson, spread_evenly
+from calib.wand.labels import label_recording
+from camera_node.foundation.arrays import Array
+from camera_node.geometry.body import Body
+from camera_node.geometry.lens import Lens
+from camera_node.geometry.pose import rotation_from_vector, skew
+from camera_node.protocol.messages import Detections
+
+STEPS = (
+    9  # of a grid, within two standard deviations: a quarter apart, where lenses are known by a factor of two
+)
+SAMPLE = 150  # correspondences of a pair
+PARTNERS = 4  # of a camera, those with most frame sets in common: more change no start
+ITERATIONS = 10
+SINGULAR = np.diag([1.0, 1.0, 0.0])  # values of an essential matrix
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """Half the squared misfits (STEPS, STEPS) of the cameras a and b by the focal lengths of their grids."""
+
+    a: int
+    b: int
+    misfit: Array
+
+
+def with_rough_focal_lengths(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Rig:
+    """The rig with rough focal lengths of the lenses that are not known as well as those of data sheets.
+
+    Args:
+        rig: the lenses; others than those whose `lens_sigma` is larger than usual stay.
+        wand: its markers.
+        messages: detections of all cameras, their clocks nearly right.
+
+    Raises:
+        CalibrationError: see `label_recording`.
+    """
+    if not any(_focal_sigma(lens) > FOCAL for lens in rig.cameras.values()):
+        return rig
+    recording = label_recording(rig, wand, messages)
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.timing)
+    sigma = np.array([_focal_sigma(rig.cameras[name]) for name in recording.names])
+    sigma[sigma <= FOCAL] = 0.0
+    factors, cameras = find_focal_factors(pairs, sigma), dict(rig.cameras)
+    for name, factor in zip(recording.names, factors.tolist(), strict=True):
+        lens = cameras[name]
+        cameras[name] = lens.with_parameters([factor * lens.fx, factor * lens.fy, *lens.parameters[2:]])
+    return msgspec.structs.replace(rig, cameras=cameras)
+
+
+def _focal_sigma(lens: Lens) -> float:
+    sigma = calibrated_sigma(lens)
+    return FOCAL if sigma is None else float(sigma[0])
+
+
+def find_focal_factors(pairs: TwoViewGeometry, sigma: Array) -> Array:
+    """(C,) true over given focal lengths, roughly.
+
+    Args:
+        pairs: two-view geometry by the given lenses.
+        sigma: (C,) prior standard deviations of the logarithms of the focal lengths; 0 of known lenses.
+    """
+    steps = np.linspace(-2, 2, STEPS)
+    grids = np.exp(sigma[:, None] * steps)
+    tables = [table for a, b in _choose_pairs(pairs) if (table := _tabulate(pairs, a, b, grids)) is not None]
+    starts = [_descend(np.full(len(sigma), k), tables, steps**2 / 2) for k in range(STEPS)]
+    return grids[np.arange(len(sigma)), min(starts, key=lambda start: start[1])[0]]
+
+
+def _choose_pairs(pairs: TwoViewGeometry) -> list[tuple[int, int]]:
+    """The pairs of each camera with those that share most frame sets with it."""
+    shared = pairs.count_shared()
+    np.fill_diagonal(shared, 0)
+    best = np.argsort(-shared, axis=1)[:, :PARTNERS]
+    chosen = {(min(a, b), max(a, b)) for a, row in enumerate(best.tolist()) for b in row if shared[a, b]}
+    return sorted(chosen)
+
+
+def _descend(choice: Array, tables: Sequence[_Table], prior: Array) -> tuple[Array, float]:
+    """The grid steps (C,) of a minimum of the sum of tables and priors, one camera after the other, and the sum."""
+    while True:
+        before = choice.copy()
+        for camera in range(len(choice)):
+            total = prior.copy()
+            for table in tables:
+                if camera == table.a:
+                    total += table.misfit[:, choice[table.b]]
+                elif camera == table.b:
+                    total += table.misfit[choice[table.a]]
+            choice[camera] = int(total.argmin())
+        if (choice == before).all():
+            value = sum(table.misfit[choice[table.a], choice[table.b]] for table in tables)
+            return choice, float(value + prior[choice].sum())
+
+
+def _tabulate(pairs: TwoViewGeometry, a: int, b: int, grids: Array) -> _Table | None:
+    """The table of two cameras; None where they share too few images, or their epipolar geometry is not found."""
+    focal = [(lens.fx + lens.fy) / 2 for lens in (pairs.lenses[a], pairs.lenses[b])]
+    x_a, x_b = (
+        f * xy[spread_evenly(len(xy), SAMPLE)] for f, xy in zip(focal, pairs.correspond(a, b), strict=True)
+    )
+    if len(x_a) < MIN_COMMON:
+        return None
+    F = cv2.findFundamentalMat(x_a, x_b, cv2.USAC_ACCURATE, GATE_PX, 0.9999, 2000)[0]
+    if F is None or F.shape != (3, 3):
+        return None
+    sigma = max(float(np.median(sampson(np.asarray(F, float), x_a, x_b))) / 0.6745, MIN_SIGMA_PX)
+    f_a, f_b = np.meshgrid(grids[a] * focal[0], grids[b] * focal[1], indexing="ij")
+    misfit = _fit_essential_matrices(F, x_a, x_b, np.column_stack([f_a.ravel(), f_b.ravel()]), sigma)
+    return _Table(a, b, misfit.reshape(STEPS, STEPS))
+
+
+def _fit_essential_matrices(F: Array, x_a: Array, x_b: Array, focal: Array, sigma: float) -> Array:
+    """Half the least squared misfits (g,) of the essential matrices of g pairs of focal lengths (g, 2), pixels, under
+    Cauchy's kernel, by Levenberg-Marquardt from the essential matrix nearest to a fundamental one.
+
+    An essential matrix is U diag(1, 1, 0) V^T, of which a step turns U and V.
+    """
+    h_a, h_b = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
+    products = (h_b[:, :, None] * h_a[:, None]).reshape(len(x_a), 9)
+    K_a, K_b = (np.eye(3) * np.column_stack([f, f, np.ones(len(f))])[:, None] for f in focal.T)
+    inverse_a, inverse_b, turns = np.linalg.inv(K_a), np.linalg.inv(K_b), skew(np.eye(3))
+
+    def residuals(U: Array, V: Array) -> tuple[Array, Array, Array]:
+        matrices = inverse_b @ U @ SINGULAR @ V @ inverse_a
+        line_b, line_a = h_a @ np.swapaxes(matrices, 1, 2), h_b @ matrices
+        slope = sigma * np.sqrt((line_b[..., :2] ** 2).sum(axis=2) + (line_a[..., :2] ** 2).sum(axis=2))
+        error = (line_b * h_b).sum(axis=2) / slope
+        return error, slope, CAUCHY_SCALE**2 / 2 * np.log1p((error / CAUCHY_SCALE) ** 2).sum(axis=1)
+
+    U, _, V = np.linalg.svd(K_b @ F @ K_a)
+    (error, slope, cost), damping = residuals(U, V), np.full(len(focal), 1e-3)
+    for _ in range(ITERATIONS):
+        by_turns = np.concatenate(
+            [U[:, None] @ turns @ SINGULAR @ V[:, None], U[:, None] @ SINGULAR @ turns @ V[:, None]], axis=1
+        )
+        by_turns = (inverse_b[:, None] @ by_turns @ inverse_a[:, None]).reshape(len(focal), 6, 9)
+        J = products @ np.swapaxes(by_turns, 1, 2) / slope[:, :, None]
+        weighted = J / (1 + (error / CAUCHY_SCALE) ** 2)[:, :, None]
+        H = np.swapaxes(weighted, 1, 2) @ J
+        H += damping[:, None, None] * np.einsum("gii->gi", H).mean(axis=1)[:, None, None] * np.eye(6)
+        step = -np.linalg.solve(H, np.swapaxes(weighted, 1, 2) @ error[:, :, None])[:, :, 0]
+        moved = (U @ rotation_from_vector(step[:, :3]), rotation_from_vector(step[:, 3:]) @ V)
+        after = residuals(*moved)
+        better = after[2] < cost
+        damping = np.where(better, np.maximum(damping / 10, 1e-6), damping * 10)
+        U, V = (np.where(better[:, None, None], new, old) for new, old in zip(moved, (U, V), strict=True))
+        error, slope = (
+            np.where(better[:, None], new, old) for new, old in zip(after[:2], (error, slope), strict=True)
+        )
+        cost = np.where(better, after[2], cost)
+    return cost
