@@ -22,7 +22,7 @@ from calib.wand.bundle_adjustment.problem_setup import MIN_SIGMA_PX
 from calib.wand.bundle_adjustment.residuals import CAUCHY_SCALE
 from calib.wand.initial_rig import GATE_PX, MIN_COMMON, TwoViewGeometry, sampson, spread_evenly
 from calib.wand.labels import label_recording
-from camera_node.foundation.arrays import Array
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector, skew
@@ -85,8 +85,9 @@ def find_focal_factors(pairs: TwoViewGeometry, sigma: Array) -> Array:
     steps = np.linspace(-2, 2, STEPS)
     grids = np.exp(sigma[:, None] * steps)
     tables = [table for a, b in _choose_pairs(pairs) if (table := _tabulate(pairs, a, b, grids)) is not None]
-    starts = [_descend(np.full(len(sigma), k), tables, steps**2 / 2) for k in range(STEPS)]
-    return grids[np.arange(len(sigma)), min(starts, key=lambda start: start[1])[0]]
+    starts = [_descend(np.full(len(sigma), k, np.intp), tables, steps**2 / 2) for k in range(STEPS)]
+    best = min(starts, key=lambda start: start[1])[0]
+    return np.take_along_axis(grids, best[:, None], axis=1)[:, 0]
 
 
 def _choose_pairs(pairs: TwoViewGeometry) -> list[tuple[int, int]]:
@@ -98,7 +99,7 @@ def _choose_pairs(pairs: TwoViewGeometry) -> list[tuple[int, int]]:
     return sorted(chosen)
 
 
-def _descend(choice: Array, tables: Sequence[_Table], prior: Array) -> tuple[Array, float]:
+def _descend(choice: Index, tables: Sequence[_Table], prior: Array) -> tuple[Index, float]:
     """The grid steps (C,) of a minimum of the sum of tables and priors, one camera after the other, and the sum."""
     while True:
         before = choice.copy()
@@ -123,52 +124,76 @@ def _tabulate(pairs: TwoViewGeometry, a: int, b: int, grids: Array) -> _Table | 
     )
     if len(x_a) < MIN_COMMON:
         return None
-    F = cv2.findFundamentalMat(x_a, x_b, cv2.USAC_ACCURATE, GATE_PX, 0.9999, 2000)[0]
-    if F is None or F.shape != (3, 3):
+    found = cv2.findFundamentalMat(x_a, x_b, cv2.USAC_ACCURATE, GATE_PX, 0.9999, 2000)[0]
+    if found is None or found.shape != (3, 3):
         return None
-    sigma = max(float(np.median(sampson(np.asarray(F, float), x_a, x_b))) / 0.6745, MIN_SIGMA_PX)
+    F = np.asarray(found, float)
+    sigma = max(float(np.median(sampson(F, x_a, x_b))) / 0.6745, MIN_SIGMA_PX)
     f_a, f_b = np.meshgrid(grids[a] * focal[0], grids[b] * focal[1], indexing="ij")
-    misfit = _fit_essential_matrices(F, x_a, x_b, np.column_stack([f_a.ravel(), f_b.ravel()]), sigma)
+    misfit = _Epipolar.of(x_a, x_b, f_a.ravel(), f_b.ravel(), sigma).fit(F)
     return _Table(a, b, misfit.reshape(STEPS, STEPS))
 
 
-def _fit_essential_matrices(F: Array, x_a: Array, x_b: Array, focal: Array, sigma: float) -> Array:
-    """Half the least squared misfits (g,) of the essential matrices of g pairs of focal lengths (g, 2), pixels, under
-    Cauchy's kernel, by Levenberg-Marquardt from the essential matrix nearest to a fundamental one.
+@dataclass(frozen=True, slots=True)
+class _Epipolar:
+    """The epipolar constraints of n images in two cameras, for g pairs of focal lengths.
 
-    An essential matrix is U diag(1, 1, 0) V^T, of which a step turns U and V.
+    An essential matrix is U diag(1, 1, 0) V, of which a step turns U and V.
+
+    Attributes:
+        h_a, h_b: (n, 3) homogeneous pixels, from the images' centres.
+        inverse_a, inverse_b: (g, 3, 3) inverses of the calibration matrices.
+        sigma: of a Sampson distance, pixels.
     """
-    h_a, h_b = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
-    products = (h_b[:, :, None] * h_a[:, None]).reshape(len(x_a), 9)
-    K_a, K_b = (np.eye(3) * np.column_stack([f, f, np.ones(len(f))])[:, None] for f in focal.T)
-    inverse_a, inverse_b, turns = np.linalg.inv(K_a), np.linalg.inv(K_b), skew(np.eye(3))
 
-    def residuals(U: Array, V: Array) -> tuple[Array, Array, Array]:
-        matrices = inverse_b @ U @ SINGULAR @ V @ inverse_a
-        line_b, line_a = h_a @ np.swapaxes(matrices, 1, 2), h_b @ matrices
-        slope = sigma * np.sqrt((line_b[..., :2] ** 2).sum(axis=2) + (line_a[..., :2] ** 2).sum(axis=2))
-        error = (line_b * h_b).sum(axis=2) / slope
-        return error, slope, CAUCHY_SCALE**2 / 2 * np.log1p((error / CAUCHY_SCALE) ** 2).sum(axis=1)
+    h_a: Array
+    h_b: Array
+    inverse_a: Array
+    inverse_b: Array
+    sigma: float
 
-    U, _, V = np.linalg.svd(K_b @ F @ K_a)
-    (error, slope, cost), damping = residuals(U, V), np.full(len(focal), 1e-3)
-    for _ in range(ITERATIONS):
-        by_turns = np.concatenate(
-            [U[:, None] @ turns @ SINGULAR @ V[:, None], U[:, None] @ SINGULAR @ turns @ V[:, None]], axis=1
-        )
-        by_turns = (inverse_b[:, None] @ by_turns @ inverse_a[:, None]).reshape(len(focal), 6, 9)
-        J = products @ np.swapaxes(by_turns, 1, 2) / slope[:, :, None]
-        weighted = J / (1 + (error / CAUCHY_SCALE) ** 2)[:, :, None]
-        H = np.swapaxes(weighted, 1, 2) @ J
-        H += damping[:, None, None] * np.einsum("gii->gi", H).mean(axis=1)[:, None, None] * np.eye(6)
-        step = -np.linalg.solve(H, np.swapaxes(weighted, 1, 2) @ error[:, :, None])[:, :, 0]
-        moved = (U @ rotation_from_vector(step[:, :3]), rotation_from_vector(step[:, 3:]) @ V)
-        after = residuals(*moved)
-        better = after[2] < cost
-        damping = np.where(better, np.maximum(damping / 10, 1e-6), damping * 10)
-        U, V = (np.where(better[:, None, None], new, old) for new, old in zip(moved, (U, V), strict=True))
-        error, slope = (
-            np.where(better[:, None], new, old) for new, old in zip(after[:2], (error, slope), strict=True)
-        )
-        cost = np.where(better, after[2], cost)
-    return cost
+    @classmethod
+    def of(cls, x_a: Array, x_b: Array, f_a: Array, f_b: Array, sigma: float) -> "_Epipolar":
+        """Those of pixels (n, 2) and focal lengths (g,)."""
+        homogeneous = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
+        inverses = (np.eye(3) * np.column_stack([1 / f, 1 / f, np.ones(len(f))])[:, None] for f in (f_a, f_b))
+        return cls(*homogeneous, *inverses, sigma)
+
+    def fit(self, F: Array) -> Array:
+        """Half the least squared misfits (g,) under Cauchy's kernel, by Levenberg-Marquardt from the essential matrices
+        nearest to a fundamental matrix."""
+        U, _, V = np.linalg.svd(np.linalg.inv(self.inverse_b) @ F @ np.linalg.inv(self.inverse_a))
+        errors, slopes = self._errors(U, V)
+        cost, damping = _cost(errors), np.full(len(U), 1e-3)
+        for _ in range(ITERATIONS):
+            J = self._jacobians(U, V, slopes)
+            weighted = J / (1 + (errors / CAUCHY_SCALE) ** 2)[:, :, None]
+            H = np.swapaxes(weighted, 1, 2) @ J
+            H += (damping * np.einsum("gii->g", H))[:, None, None] * np.eye(6)
+            step = -np.linalg.solve(H, np.swapaxes(weighted, 1, 2) @ errors[:, :, None])[:, :, 0]
+            turned = U @ rotation_from_vector(step[:, :3]), rotation_from_vector(step[:, 3:]) @ V
+            after = self._errors(*turned)
+            better = _cost(after[0]) < cost
+            damping = np.where(better, np.maximum(damping / 10, 1e-6), damping * 10)
+            for old, new in zip((U, V, errors, slopes), (*turned, *after), strict=True):
+                old[better] = new[better]
+            cost = _cost(errors)
+        return cost
+
+    def _errors(self, U: Array, V: Array) -> tuple[Array, Array]:
+        """(g, n) Sampson distances in standard deviations, and the slopes by which epipolar errors are divided."""
+        F = self.inverse_b @ U @ SINGULAR @ V @ self.inverse_a
+        line_b, line_a = self.h_a @ np.swapaxes(F, 1, 2), self.h_b @ F
+        slopes = self.sigma * np.sqrt((line_b[..., :2] ** 2 + line_a[..., :2] ** 2).sum(axis=2))
+        return (line_b * self.h_b).sum(axis=2) / slopes, slopes
+
+    def _jacobians(self, U: Array, V: Array, slopes: Array) -> Array:
+        """(g, n, 6) derivatives of the errors by turns of U and V, with constant slopes."""
+        turns, products = skew(np.eye(3)), (self.h_b[:, :, None] * self.h_a[:, None]).reshape(-1, 9)
+        by_turns = np.concatenate([turns @ SINGULAR, SINGULAR @ turns])
+        by_turns = (self.inverse_b @ U)[:, None] @ by_turns @ (V @ self.inverse_a)[:, None]
+        return products @ np.swapaxes(by_turns.reshape(-1, 6, 9), 1, 2) / slopes[:, :, None]
+
+
+def _cost(errors: Array) -> Array:
+    return CAUCHY_SCALE**2 / 2 * np.log1p((errors / CAUCHY_SCALE) ** 2).sum(axis=1)
