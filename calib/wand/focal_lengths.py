@@ -155,9 +155,11 @@ class _Epipolar:
     @classmethod
     def of(cls, x_a: Array, x_b: Array, f_a: Array, f_b: Array, sigma: float) -> "_Epipolar":
         """Those of pixels (n, 2) and focal lengths (g,)."""
-        homogeneous = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
-        inverses = (np.eye(3) * np.column_stack([1 / f, 1 / f, np.ones(len(f))])[:, None] for f in (f_a, f_b))
-        return cls(*homogeneous, *inverses, sigma)
+        h_a, h_b = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
+        inverse_a, inverse_b = (
+            np.eye(3) * np.column_stack([1 / f, 1 / f, np.ones(len(f))])[:, None] for f in (f_a, f_b)
+        )
+        return cls(h_a, h_b, inverse_a, inverse_b, sigma)
 
     def fit(self, F: Array) -> Array:
         """Half the least squared misfits (g,) under Cauchy's kernel, by Levenberg-Marquardt from the essential matrices
