@@ -168,6 +168,38 @@ def eliminate_bodies(
     Raises RuntimeError where a body is not determined.
     """
 
+def respond(
+    poses: FramePoses,
+    camera: Index,
+    n_cameras: int,
+    equations: Array,
+    weights: Array,
+    rig_share: Array,
+    frame: Index,
+    body: Index,
+    xy: Array,
+    whiten: Array,
+    information: Array,
+    P: Array,
+    T: Array,
+    dt: Array,
+    responses: Array,
+    counted: Array,
+    /,
+) -> tuple[Array, Array]:
+    """The responses (B, 12, 8 C) of B bodies to the errors of C cameras after a filter's step, and the parts
+    (B, 12, 12) of P that count these errors as noise: `responses` and `counted` are those before it.
+
+    camera (F,) of the frames; equations (N, 2, 13) of N centres, their weights, shares of the variances that are
+    counted for the cameras, frames and bodies (N,), xy (2, N) and whiten (2, 2, N); information of the predictions and
+    P after the update (B, 12, 12); T (B, 3, 3) and dt (B,): see `fusion.model.states.Transition`.
+    """
+
+def consider(P: Array, counted: Array, responses: Array, factor: Array, /) -> Array:
+    """(B, 12, 12) covariances of B bodies with the errors of C cameras, whose covariance has the lower triangular
+    factor (8 C, 8 C): P without the part that counts these as noise. See `respond`.
+    """
+
 def inverses(information: Array, /) -> Array:
     """(K, 12, 12) inverses of positive definite matrices; raises RuntimeError for others."""
 

@@ -5,8 +5,8 @@ Detection. A level disc of diameter d_o is an ellipse whose half axes are the si
 with J the derivative of the image by the point (the lens is taken as affine over one roundel). Detector noise comes
 from a table over both axes, because `predict_precision` follows the edge of each roundel.
 
-Estimate. Tracking weighs each detection by the noise that its detector reports and a floor (`fusion`,
-`sigma_floor_px`), and treats calibration and capture times as exact. With J the derivative of the pixels by the point,
+Estimate. Tracking weighs each detection by the noise that its detector reports and the calibration's error in the
+image (`USUAL_PX`), and holds cameras and capture times fixed. With J the derivative of the pixels by the point,
 W the weights and S the true covariance of a detection, the estimate has the covariance A^-1 B A^-1, A = sum J^T W J,
 B = sum J^T W S W J.
 """
@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from calib.plan.camera_kind import CameraKind
 from calib.plan.description import Plan
 from calib.rig.camera import Camera, pixel_jacobians, transform
+from calib.rig.camera_errors import USUAL_PX
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, skew
@@ -37,7 +38,6 @@ SLANT = np.linspace(0.08, 0.99, 16)  # minor over major axis
 LEAST_INSET, CUT_EXPONENT = 0.3, 1.3
 NEAR_M = 0.01  # roundels nearer to the camera's plane are not seen
 FOCAL_PX = 1000.0  # of the lens for which the table is computed; the precision in pixels hardly depends on it
-FLOOR_PX = 0.05  # `sigma_floor_px` of fusion's limits; a test compares them
 MIN_MARKERS = 3  # from which the orientation of a robot is determined by its markers' positions
 TINY_PX = 1e-3  # keeps covariances regular
 REGULAR_M = (
@@ -271,7 +271,7 @@ def weigh_view(
     sums = CombinedViews.of_none(len(points))
     view = sensor.view(camera, points)
     J = view.jacobian
-    weighted = np.linalg.inv(view.noise + FLOOR_PX**2 * np.eye(2)) @ J
+    weighted = np.linalg.inv(view.noise + USUAL_PX**2 * np.eye(2)) @ J
     own = view.noise + uncertainty.sigma_px**2 * np.eye(2)
     common = _common_covariance(camera, points[view.rows], J, uncertainty.speed_m_s * sensor.stamp_sigma_s)
     sums.information[view.rows] = J.mT @ weighted

@@ -7,9 +7,6 @@ import msgspec
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Tunable limits; the defaults suit printed roundels and calibrated cameras."""
 
-    # Error of a camera's calibration, added in quadrature to the noise that detectors report: 0.01 to 0.06 px after a
-    # wand calibration with carefully calibrated lenses.
-    sigma_floor_px: float = 0.05
     lost_after_s: float = 0.3  # without an observation
     lateness_ms: float = 150.0  # how long a frame set waits for a camera; USB cameras can be 100 ms late
     tracked_sigma_m: float = (

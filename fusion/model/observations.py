@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
+from calib.rig.camera_errors import error_covariance, image_errors
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.columns import Columns
 from camera_node.geometry.outline import half_axes_of
@@ -105,6 +106,8 @@ class CameraArray:
         R_cam_world: (C, 3, 3).
         centres: (C, 3) centres of projection, world frame.
         focal: (C,) mean focal lengths, pixels.
+        covariance: (8 C, 8 C) of the errors of the cameras; see `calib.rig.camera_errors`.
+        error_px: (C,) what these errors displace in the images, RMS of a coordinate.
         revision: counts the changes of camera poses.
     """
 
@@ -136,6 +139,8 @@ class CameraArray:
         self.R_cam_world = np.ascontiguousarray(T[:, :3, :3].transpose(0, 2, 1))
         self.centres = np.ascontiguousarray(T[:, :3, 3])
         self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
+        self.covariance = error_covariance(list(cameras))
+        self.error_px = image_errors(list(cameras), self.covariance)
 
     def frame_poses(self, states: States, exposures: Exposures) -> _core.FramePoses:
         """The poses of all bodies at the capture times of all frames."""
@@ -211,8 +216,8 @@ class DetectionTable(Columns):
         return -np.asarray(np.linalg.inv(dual), float)
 
     @classmethod
-    def of(cls, frame_set: FrameSet, cameras: CameraArray, floor_px: float) -> "DetectionTable":
-        """The detections of a frame set; `floor_px` is added in quadrature to the noise that detectors report."""
+    def of(cls, frame_set: FrameSet, cameras: CameraArray) -> "DetectionTable":
+        """The detections of a frame set; errors of the cameras are added to the noise that detectors report."""
         frames = frame_set.frames
         exposures = Exposures(
             np.array([cameras.index[frame.camera] for frame in frames], np.intp),
@@ -222,7 +227,7 @@ class DetectionTable(Columns):
         )
         row = np.repeat(np.arange(len(frames)), [len(frame.roundels) for frame in frames])
         cov = _concatenate([f.roundels.cov.transpose(1, 2, 0) for f in frames], (2, 2, 0))
-        cov[[0, 1], [0, 1]] += floor_px**2
+        cov[[0, 1], [0, 1]] += cameras.error_px[exposures.camera[row]] ** 2
         return cls(
             exposures,
             row,

@@ -21,17 +21,14 @@ class CameraMonitors:
         markers: of all robots.
         single: (R,) robots with a single marker.
         densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
-        floor_px: the error of a calibration in the image (`Limits`).
     """
 
-    def __init__(
-        self, cameras: CameraArray, markers: MarkerTable, single: Mask, densities: Array, floor_px: float
-    ) -> None:
+    def __init__(self, cameras: CameraArray, markers: MarkerTable, single: Mask, densities: Array) -> None:
         self._cameras = cameras
         self.clocks = CameraClocks(cameras, markers, single)
         self.frozen = FrozenImages(cameras, markers)
         self.consistency = FrameConsistency(cameras, markers)
-        self.rig = RigMonitor(cameras, markers, densities, floor_px)
+        self.rig = RigMonitor(cameras, markers, densities)
 
     @property
     def withheld(self) -> set[str]:

@@ -144,7 +144,6 @@ def window_of(
     cameras: CameraArray,
     markers: MarkerTable,
     densities: Array,
-    floor_px: float,
 ) -> tuple[Window, Array]:
     """The problem of some keyframes, and for each camera the errors (C, 8) that explain its images alone.
 
@@ -153,7 +152,6 @@ def window_of(
         cameras: C cameras of the rig.
         markers: of all robots.
         densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
-        floor_px: the error of a calibration in the image (`Limits`).
     """
     starts = np.zeros((len(cameras.names), ERRORS))
     found: list[list[tuple[CalibratedFrame, Index, Index]]] = [[] for _ in keyframes]
@@ -164,7 +162,7 @@ def window_of(
         starts[k, :3], starts[k, 3:6] = vector_from_rotation(inverse[None, :3, :3])[0], inverse[:3, 3]
         for (number, view), (rows, detections) in zip(views, matches, strict=True):
             found[number].append((view.frame, view.rows[rows], detections))
-    return _assemble(keyframes, found, cameras, markers, (densities, floor_px)), starts
+    return _assemble(keyframes, found, cameras, markers, densities), starts
 
 
 def _views(keyframes: Sequence[Keyframe], name: str) -> list[tuple[int, FrameView]]:
@@ -255,14 +253,13 @@ def _assemble(
     found: Sequence[Sequence[tuple[CalibratedFrame, Index, Index]]],
     cameras: CameraArray,
     markers: MarkerTable,
-    noise: tuple[Array, float],
+    densities: Array,
 ) -> Window:
     """The problem of matched detections: of each keyframe its frames, with rows of markers and of detections."""
-    densities, floor_px = noise
     tables, discs, n_frames, n_bodies = [], [], 0, 0
     for keyframe, matched in zip(keyframes, found, strict=True):
         frames = FrameSet(keyframe.t_ns, tuple(frame for frame, _, _ in matched))
-        table = DetectionTable.of(frames, cameras, floor_px)
+        table = DetectionTable.of(frames, cameras)
         first = np.cumsum([0, *(len(frame.roundels) for frame in frames.frames)])
         rows = np.concatenate(
             [np.empty(0, np.intp), *(at + d for at, (_, _, d) in zip(first, matched, strict=False))]
@@ -289,7 +286,7 @@ def _assemble(
     return Window(
         names=cameras.names,
         T=np.array([cameras[name].matrix() for name in cameras.names]),
-        prior=_prior(cameras, states, exposures, floor_px),
+        prior=_prior(cameras, exposures),
         states=states,
         velocity_sigma=np.sqrt(
             densities[robots] * (1e-9 * HALF_NS / 6)
@@ -309,19 +306,15 @@ def _are_determined(robot: Index, camera: Index) -> Mask:
     return determined[robot]
 
 
-def _prior(cameras: CameraArray, states: States, exposures: Exposures, floor_px: float) -> Array:
-    """(C, 8, 8) information about the errors of the calibrated cameras; `floor_px` at the robots at least."""
+def _prior(cameras: CameraArray, exposures: Exposures) -> Array:
+    """(C, 8, 8) information about the errors of the calibrated cameras."""
     found = np.zeros((len(cameras.names), ERRORS, ERRORS))
     for k, name in enumerate(cameras.names):
-        camera, covariance = cameras[name], np.zeros((ERRORS, ERRORS))
-        range_m = np.linalg.norm(states.p - cameras.centres[k], axis=1).mean()
-        pixel = floor_px / cameras.focal[k]
-        covariance[range(6), range(6)] = np.repeat([pixel, pixel * range_m], 3) ** 2
-        if camera.covariance is not None:
-            covariance[:6, :6] += camera.covariance
+        camera, own = cameras[name], slice(ERRORS * k, ERRORS * (k + 1))
+        covariance = cameras.covariance[own, own].copy()
         stamps_s = exposures.tau_sigma[exposures.camera == k].max(initial=0.0)
         covariance[6, 6] = OFFSET_SIGMA_S**2 + stamps_s**2
         focal = camera.lens_sigma[0] / camera.fx if camera.lens_sigma is not None else FOCAL_STABILITY
-        covariance[7, 7] = max(focal, pixel) ** 2
+        covariance[7, 7] += focal**2
         found[k] = np.linalg.inv(covariance)
     return found

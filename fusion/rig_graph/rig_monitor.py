@@ -73,7 +73,6 @@ class RigMonitor:
         cameras: cameras of the rig.
         markers: of all robots.
         densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
-        floor_px: the error of a calibration in the image (`Limits`).
 
     Attributes:
         excluded: names of moved cameras whose poses are not known yet.
@@ -83,9 +82,9 @@ class RigMonitor:
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
     """
 
-    def __init__(self, cameras: CameraArray, markers: MarkerTable, densities: Array, floor_px: float) -> None:
+    def __init__(self, cameras: CameraArray, markers: MarkerTable, densities: Array) -> None:
         self._cameras, self._markers = cameras, markers
-        self._densities, self._floor_px = densities, floor_px
+        self._densities = densities
         self._keyframes = Keyframes(cameras, markers, max(WINDOWS))
         self._job: Future[tuple[Window, Verdict] | None] | None = None
         self._checked_ns = self._revision = self._n_undecided = 0
@@ -180,7 +179,7 @@ class RigMonitor:
             self._checked_ns = now.t_ns
             self._revision = self._cameras.revision
             given = self._cameras.as_dict()  # of this moment
-            job = partial(judge_latest, tuple(kept), given, self._markers, self._densities, self._floor_px)
+            job = partial(judge_latest, tuple(kept), given, self._markers, self._densities)
             self._job = _done(job) if self.executor is None else self.executor.submit(job)
         if self._job is None or not self._job.done():
             return ()
@@ -307,13 +306,12 @@ def judge_latest(
     cameras: Mapping[str, Camera],
     markers: MarkerTable,
     densities: Array,
-    floor_px: float,
 ) -> tuple[Window, Verdict] | None:
     """Judge the longest window in which nothing changed; None without one."""
     array = CameraArray(dict(cameras))
     for n in WINDOWS:
         if n <= len(keyframes):
-            window, starts = window_of(keyframes[-n:], array, markers, densities, floor_px)
+            window, starts = window_of(keyframes[-n:], array, markers, densities)
             verdict = judge(window, starts)
             if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict

@@ -71,7 +71,6 @@ class Association:
         markers: (M,) rows of the marker table: the markers of the tracked robots.
         expected: the same with the covariances of their positions.
         t_ns: time of the frame set.
-        floor_px: see `DetectionTable.of`.
         parts: the frames assigned so far.
     """
 
@@ -82,7 +81,6 @@ class Association:
     markers: Index
     expected: _core.ExpectedMarkers
     t_ns: int
-    floor_px: float
     parts: tuple[_AssignedFrames, ...] = ()
 
     @classmethod
@@ -93,7 +91,6 @@ class Association:
         states: States,
         tracked: Mask,
         t_ns: int,
-        floor_px: float,
     ) -> "Association":
         """No assignments yet.
 
@@ -103,11 +100,10 @@ class Association:
             states: robots predicted at `t_ns`.
             tracked: (N,) robots whose markers are expected.
             t_ns: time of the frame set.
-            floor_px: see `DetectionTable.of`.
         """
         rows = np.flatnonzero(tracked[marker_table.robot])
         expected = marker_table.expected(rows, states)
-        return cls(cameras, cameras.revision, marker_table, states, rows, expected, t_ns, floor_px)
+        return cls(cameras, cameras.revision, marker_table, states, rows, expected, t_ns)
 
     def is_of(self, t_ns: int, cameras: CameraArray, marker_table: MarkerTable) -> bool:
         """Whether this is of the frame set at `t_ns`, of these markers, and of the present poses of the cameras."""
@@ -123,7 +119,7 @@ class Association:
         new = self.pending(frames)
         if not new:
             return self
-        detections = DetectionTable.of(FrameSet(self.t_ns, new), self.cameras, self.floor_px)
+        detections = DetectionTable.of(FrameSet(self.t_ns, new), self.cameras)
         detection, marker = self._assign(detections)
         frame = detections.frame[detection]
         part = _AssignedFrames(new, frame, detection - _first_rows(new)[frame], marker)
@@ -131,7 +127,7 @@ class Association:
 
     def collect(self, frame_set: FrameSet) -> tuple[DetectionTable, Assignments]:
         """All detections of the frame set, and its assignments in the order of the detections."""
-        detections = DetectionTable.of(frame_set, self.cameras, self.floor_px)
+        detections = DetectionTable.of(frame_set, self.cameras)
         first = dict(zip(map(id, frame_set.frames), _first_rows(frame_set.frames).tolist(), strict=True))
         marker_of = np.full(len(detections), -1)
         for part in self.parts:

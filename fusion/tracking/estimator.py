@@ -86,6 +86,7 @@ class _Solution:
         delta: (B, 12) errors of all bodies relative to the prediction.
         step: (K, 12) last step of the visible bodies.
         information: (K, 12, 12) of the visible bodies.
+        equations: (N + S, 2, 13) linearized.
         weights: (N + S,) of the equations.
         residuals: (2, N + S) whitened.
     """
@@ -93,16 +94,35 @@ class _Solution:
     delta: Array
     step: Array
     information: Array
+    equations: Array
     weights: Array
     residuals: Array
 
     def updated(self, bodies: Mask, equations: Mask, part: "_Solution") -> "_Solution":
         """With another iteration of some of the K bodies, which have these equations; the others have no step."""
         step, information = np.zeros_like(self.step), self.information.copy()
-        weights, residuals = self.weights.copy(), self.residuals.copy()
+        rows, weights, residuals = self.equations.copy(), self.weights.copy(), self.residuals.copy()
         step[bodies], information[bodies] = part.step, part.information
-        weights[equations], residuals[:, equations] = part.weights, part.residuals
-        return _Solution(part.delta, step, information, weights, residuals)
+        rows[equations], weights[equations] = part.equations, part.weights
+        residuals[:, equations] = part.residuals
+        return _Solution(part.delta, step, information, rows, weights, residuals)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyFit:
+    """Bodies after the observations of a frame set.
+
+    Attributes:
+        states: of all bodies; those without observations stay as predicted.
+        residuals: (2, N) in pixels, NaN where the disc is not visible.
+        equations: (N, 2, 13) of the centres, as they were linearized last; see `_core.FramePoses`.
+        weights: (N,) of these.
+    """
+
+    states: States
+    residuals: Array
+    equations: Array
+    weights: Array
 
 
 class Estimator:
@@ -140,20 +160,19 @@ class Estimator:
         Raises:
             RuntimeError: the system of a body is singular (from GTSAM or the native core).
         """
-        return self.fit(prediction, self.prepared(prediction.states, observations), small)
+        fitted = self.fit(prediction, self.prepared(prediction.states, observations), small)
+        return fitted.states, fitted.residuals
 
     def prepared(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """Observations as `fit` takes them: with straight outlines, and the noise of late frames and of clocks."""
         return self.with_time_errors(states, self._straighten(states, observations))
 
-    def fit(
-        self, prediction: Prediction, observations: MatchedObservations, small: float = SMALL
-    ) -> tuple[States, Array]:
+    def fit(self, prediction: Prediction, observations: MatchedObservations, small: float = SMALL) -> BodyFit:
         """`update` by `prepared` observations."""
         states, n = prediction.states, len(prediction.states)
         bodies = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
         if not len(bodies):
-            return states, np.empty((2, 0))
+            return BodyFit(states, np.empty((2, 0)), np.empty((0, 2, 13)), np.empty(0))
         problem = _Problem(observations, _shaped(observations), bodies, prediction.information[bodies])
         solution = self._solve(problem, states, np.zeros((n, 12)))
         for _ in range(MAX_ITERATIONS - 1):
@@ -168,7 +187,13 @@ class Estimator:
         P[bodies] = _core.inverses(solution.information)
         if self.single.any():
             P[self.single] = reset_unobservable(P[self.single])
-        return replace(states.retract(solution.delta), P=P), _in_pixels(observations, solution.residuals)
+        centres = slice(len(observations))
+        return BodyFit(
+            replace(states.retract(solution.delta), P=P),
+            _in_pixels(observations, solution.residuals),
+            solution.equations[centres],
+            solution.weights[centres],
+        )
 
     def with_time_errors(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """With the noise of late frames and of the clocks of the cameras."""
@@ -208,7 +233,8 @@ class Estimator:
         step = _eliminate(information, right)
         delta = delta.copy()
         delta[problem.bodies] += step
-        return _Solution(delta, step, information, weights, _core.residuals(equations, body, step))
+        residuals = _core.residuals(equations, body, step)
+        return _Solution(delta, step, information, equations, weights, residuals)
 
     def _linearize(self, states: States, problem: _Problem) -> Array:
         """(N + S, 2, 13) equations of the centres, then of the outlines; see `_core.FramePoses`."""

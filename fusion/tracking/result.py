@@ -13,7 +13,7 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.model.frames import FrameSet
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
-from fusion.model.states import POSITION, States
+from fusion.model.states import States
 from fusion.protocol.pose_messages import Latency, Markers, RobotPose
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.rays import Marker
@@ -43,8 +43,6 @@ class ObservationSummary:
         n_markers: (R,) observed markers.
         mean_px2: (R, C) mean squared residual by robot and camera; NaN without observations.
         residual_px: (R,) RMS over all cameras; NaN without observations.
-        common_error: (R,) standard deviation of a position, where the calibration's error is common to the markers in a
-            view, over the filter's, to which it is independent; see `claimed_covariances`.
     """
 
     robot_cameras: Mask
@@ -52,7 +50,6 @@ class ObservationSummary:
     n_markers: Index
     mean_px2: Array
     residual_px: Array
-    common_error: Array
 
     @classmethod
     def of(
@@ -62,9 +59,8 @@ class ObservationSummary:
         n_robots: int,
         detections: DetectionTable,
         assignments: Assignments,
-        floor_px: float,
     ) -> "ObservationSummary":
-        """Summarize the assignments of a frame set; `floor_px` is the part of the noise that calibration causes."""
+        """Summarize the assignments of a frame set."""
         n_cameras = len(cameras.names)
         robot, camera = marker_table.robot[assignments.marker], detections.camera[assignments.detection]
         marker_cameras = np.zeros((len(marker_table), n_cameras), bool)
@@ -74,10 +70,7 @@ class ObservationSummary:
         squared_px2 = np.bincount(view, assignments.squared_px, n_robots * n_cameras).reshape(shape)
         mean_px2, mean = _ratio(squared_px2, count), _ratio(squared_px2.sum(1), count.sum(1))
         n_markers = np.bincount(marker_table.robot[marker_cameras.any(1)], minlength=n_robots)
-        cov = detections.cov[:, :, assignments.detection]
-        share = 2 * floor_px**2 / (cov[0, 0] + cov[1, 1])
-        added = np.bincount(robot, (count.ravel()[view] - 1) * share, n_robots) / np.maximum(count.sum(1), 1)
-        return cls(count > 0, marker_cameras, n_markers, mean_px2, np.sqrt(mean), np.sqrt(1 + added))
+        return cls(count > 0, marker_cameras, n_markers, mean_px2, np.sqrt(mean))
 
 
 def _ratio(sums: NDArray, count: Index) -> Array:
@@ -93,11 +86,13 @@ class FilterStep:
         states: after the observations.
         prediction: before the observations.
         continued: (R,) robots whose states follow from this prediction.
+        rig: (R, 12, 12) covariances by the errors of the cameras, which filter and smoother leave out.
     """
 
     states: States
     prediction: Prediction
     continued: Mask
+    rig: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,17 +136,6 @@ def latency_of(frame_set: FrameSet, begun_ns: int, done_ns: int) -> Latency | No
     )
 
 
-def claimed_covariances(states: States, summary: ObservationSummary) -> Array:
-    """(R, 12, 12) the filter's covariances with the calibration's error in the positions.
-
-    That error is the same for all markers of a robot in a view, but the filter averages it over them: of n markers it
-    counts an nth.
-    """
-    size = np.ones((len(states), 12))
-    size[:, POSITION] = summary.common_error[:, None]
-    return states.P * size[:, :, None] * size[:, None]
-
-
 def robot_poses(
     table: TrackTable, cameras: CameraArray, t_ns: int, summary: ObservationSummary, rows: list[int]
 ) -> dict[int, RobotPose]:
@@ -161,7 +145,7 @@ def robot_poses(
     states, names, status = table.states, cameras.names, table.status
     p, v, omega = _tuples(states.p), _tuples(states.v), _tuples(states.omega)
     wxyz, residual = _tuples(wxyz_from_rotation(states.R)), summary.residual_px.tolist()
-    P, markers = claimed_covariances(states, summary).astype("<f4").tobytes(), summary.n_markers.tolist()
+    P, markers = table.claimed.astype("<f4").tobytes(), summary.n_markers.tolist()
     owned, seen_by, age_s = (
         table.owned.tolist(),
         summary.robot_cameras.tolist(),

@@ -47,6 +47,7 @@ class RobustFit:
     Attributes:
         prediction: the robots before the update.
         detections: of the frame set, with the noise that the fit gives them.
+        observations, equations, weights: of the assignments, row by row; see `BodyFit`.
         cost, count: (R,) of each robot: its fit, as by `costs_of`, and its detections.
     """
 
@@ -54,6 +55,9 @@ class RobustFit:
     assignments: Assignments
     prediction: Prediction
     detections: DetectionTable
+    observations: MatchedObservations
+    equations: Array
+    weights: Array
     cost: Array
     count: Index
 
@@ -108,17 +112,23 @@ class RobustUpdate:
         """The updated states; a robot that its detections contradict stays as predicted and loses them."""
         observations = MatchedObservations.of(assignments, detections, self._markers)
         observations = self._estimator.prepared(prediction.states, observations)
-        states, residuals = self._estimator.fit(prediction, observations)
+        fitted = self._estimator.fit(prediction, observations)
+        states, residuals = fitted.states, fitted.residuals
         assignments = assignments.with_residuals(residuals)
         body, n, cov = observations.discs.body, len(prediction.states), observations.detections.cov
         squared = np.nan_to_num(np.sum(residuals**2, 0) * 2 / (cov[0, 0] + cov[1, 1]), nan=np.inf)
         cost = costs_of(squared, body, states.minus(prediction.states), prediction.information)
         contradicted = mean_by_body(observations.misfit(residuals) > MAX_CHI2, body, n) > CONTRADICTED
-        rows = np.flatnonzero(contradicted)
+        rows, equations, weights = np.flatnonzero(contradicted), fitted.equations, fitted.weights
         if len(rows):
             states = states.with_rows(rows, prediction.states.select(rows))
+            kept = ~contradicted[body]
+            assignments, observations = assignments.select(kept), observations.select(kept)
+            equations, weights = equations[kept], weights[kept]
         count = np.bincount(body, minlength=n)
-        return RobustFit(states, assignments.select(~contradicted[body]), prediction, detections, cost, count)
+        return RobustFit(
+            states, assignments, prediction, detections, observations, equations, weights, cost, count
+        )
 
     def _without(self, k: int, fitted: RobustFit, assignments: Assignments) -> RobustFit:
         camera = fitted.detections.camera[assignments.detection]
@@ -178,9 +188,18 @@ class RobustUpdate:
         if not len(displaced):
             return fitted
         again = np.isin(robot[rows], displaced)
-        states, _ = self._estimator.update(fitted.prediction, observations.select(again & compatible))
-        states = fitted.states.with_rows(displaced, states.select(displaced))
-        return self._with_states(fitted, states, rows[again], observations.select(again))
+        used = rows[again & compatible]
+        fit = self._estimator.fit(fitted.prediction, fitted.observations.select(used))
+        equations, weights = fitted.equations.copy(), fitted.weights.copy()
+        weights[rows[again]] = 0.0
+        equations[used], weights[used] = fit.equations, fit.weights
+        states = fitted.states.with_rows(displaced, fit.states.select(displaced))
+        squared_px = fitted.assignments.squared_px.copy()
+        squared_px[rows[again]] = np.sum(
+            self._estimator.residuals_px(states, observations.select(again)) ** 2, 0
+        )
+        assignments = replace(fitted.assignments, squared_px=squared_px)
+        return replace(fitted, states=states, assignments=assignments, equations=equations, weights=weights)
 
     def _may_be_displaced(self, fitted: RobustFit, robots: Index) -> Mask:
         """(R,) the given ones of all robots that the update moved from their predictions."""
@@ -189,15 +208,6 @@ class RobustUpdate:
         moved[robots] = True
         variance = np.einsum("nii->n", states.P[:, POSITION, POSITION]) / 3
         return moved & (np.sum((fitted.states.p - states.p) ** 2, 1) > MIN_CORRECTION**2 * variance)
-
-    def _with_states(
-        self, fitted: RobustFit, states: States, rows: Index, observations: MatchedObservations
-    ) -> RobustFit:
-        """A fit with other states, and so other residuals of some rows of its assignments."""
-        residuals = self._estimator.residuals_px(states, observations)
-        others = np.setdiff1d(np.arange(len(fitted.assignments)), rows)
-        changed = fitted.assignments.select(rows).with_residuals(residuals)
-        return replace(fitted, states=states, assignments=fitted.assignments.select(others).joined(changed))
 
 
 MAX_DEVIATION = 13.8  # chi-square with 2 degrees of freedom, one in a thousand, as the gates of association

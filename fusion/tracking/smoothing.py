@@ -19,7 +19,7 @@ from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.pose import vector_from_rotation, wxyz_from_rotation
 from fusion.model.states import OMEGA, POSITION, THETA, VELOCITY, States
 from fusion.tracking.estimator import Prediction
-from fusion.tracking.result import TrackingResult, claimed_covariances
+from fusion.tracking.result import TrackingResult
 
 LAG_NS = 3_000_000_000  # ten times as long as a robot without observations is not lost
 
@@ -60,7 +60,7 @@ class Smoother:
         return [self._with_states(*both) for both in zip(self._results[:n], smoothed[:n], strict=True)]
 
     def _with_states(self, result: TrackingResult, states: States) -> TrackingResult:
-        wxyz, P = wxyz_from_rotation(states.R), claimed_covariances(states, result.summary)
+        wxyz, P = wxyz_from_rotation(states.R), states.P + result.step.rig
         poses = tuple(
             msgspec.structs.replace(
                 pose,

@@ -31,6 +31,7 @@ class TrackTable:
         owned: (N,) robots that this shard estimates.
         states: at `t_ns`; a new object after each change.
         status: None for a robot that was never acquired.
+        claimed: (N, 12, 12) covariances of the states with the errors of the cameras, which the states' own lack.
         t_ns: time of the last frame set, or None before the first.
     """
 
@@ -42,6 +43,7 @@ class TrackTable:
         self.densities = [robot.densities for robot in self.robots]
         self.owned = np.array([shard.owns(name) for name in self.names], bool)
         self.states = States.at_rest(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), START_SIGMAS)
+        self.claimed = self.states.P
         self.status: list[TrackingState | None] = [None] * n
         self.t_ns: int | None = None
         self._limits = limits
@@ -63,8 +65,13 @@ class TrackTable:
         """(N,) seconds until `t_ns` since the last frame set that observed each robot; 0 for those in acquisition."""
         return np.where(self._seen_ns > 0, np.maximum(t_ns - self._seen_ns, 0) * 1e-9, 0.0)
 
-    def inherit(self, old: "TrackTable", renamed: dict[str, str]) -> None:
-        """Copy states and status of the robots that `old` has with the same markers; `renamed` maps old names."""
+    def inherit(self, old: "TrackTable", renamed: dict[str, str]) -> dict[int, int]:
+        """Copy states and status of the robots that `old` has with the same markers; `renamed` maps old names.
+
+        Returns:
+            their old rows by new row.
+        """
+        same: dict[int, int] = {}
         self.t_ns = old.t_ns
         old_rows = {renamed.get(name, name): k for k, name in enumerate(old.names)}
         for row, (name, robot) in enumerate(zip(self.names, self.robots, strict=True)):
@@ -73,7 +80,8 @@ class TrackTable:
                 continue
             self.states = self.states.with_rows(np.array([row]), old.states.select(np.array([k])))
             self.status[row], self._seen_ns[row] = old.status[k], old._seen_ns[k]
-            self._seen[row] = old._seen[k]
+            self._seen[row], same[row] = old._seen[k], k
+        return same
 
     def interval_s(self, t_ns: int) -> float:
         """The prediction interval from the last frame set to `t_ns`."""
@@ -142,7 +150,8 @@ class TrackTable:
     def marker_positions(self, rows: Index) -> tuple[Array, Array]:
         """Of markers `rows`: arms (K, 3) from the robot's origin and position covariances (K, 3, 3), world frame."""
         owner, positions = self.markers.robot[rows], self.markers.position.take(rows, 1)
-        covariances = self.markers.expected(rows, self.states).covariances(0.0)
+        claimed = replace(self.states, P=self.claimed)
+        covariances = self.markers.expected(rows, claimed).covariances(0.0)
         return np.einsum("nij,jn->ni", self.states.R[owner], positions), covariances
 
     def marker_normals(self, rows: Index) -> Array:
@@ -190,7 +199,7 @@ class TrackTable:
 
     def _is_uncertain(self) -> Mask:
         """(N,) robots with a position sigma above `tracked_sigma_m` along some direction."""
-        position, limit = self.states.P[:, POSITION, POSITION], self._limits.tracked_sigma_m**2
+        position, limit = self.claimed[:, POSITION, POSITION], self._limits.tracked_sigma_m**2
         uncertain = np.einsum("nii->n", position) > limit  # the trace bounds every eigenvalue
         uncertain[uncertain] = np.linalg.eigvalsh(position[uncertain])[:, -1] > limit
         return uncertain

@@ -11,9 +11,9 @@ from camera_node.foundation.arrays import Index, Mask
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
-from fusion.model.observations import Assignments, CameraArray, DetectionTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MatchedObservations
 from fusion.model.robots import Robot
-from fusion.model.states import Snapshot
+from fusion.model.states import POSITION, Snapshot
 from fusion.monitoring.camera_monitors import CameraMonitors
 from fusion.monitoring.frame_consistency import AssignedFrames
 from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
@@ -32,6 +32,7 @@ from fusion.tracking.result import (
     markers_message,
     robot_poses,
 )
+from fusion.tracking.rig_response import RigResponse
 from fusion.tracking.robust_update import RobustUpdate
 from fusion.tracking.single_view import SingleViewTracker
 from fusion.tracking.track_table import TrackTable
@@ -96,12 +97,11 @@ class Tracker:
         self.estimator = Estimator(self.cameras, densities, self.table.single)
         self.own = OwnDetections(self.cameras, self.estimator, self.table.markers)
         self.robust = RobustUpdate(self.estimator, self.table.markers)
+        self.rig_response = RigResponse(self.estimator)
         self.acquisition = Acquisition(self.cameras, self.estimator, shard.leads)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
-        self.monitors = CameraMonitors(
-            self.cameras, self.table.markers, self.table.single, densities, self.limits.sigma_floor_px
-        )
+        self.monitors = CameraMonitors(self.cameras, self.table.markers, self.table.single, densities)
         self.claims = ClaimCheck(self.estimator, self.table.markers, self.table.names)
         self.geometry = GeometryCheck(self.table.names, self.table.single)
         diameters = np.array([robot.diameter_m for robot in robots.values()])
@@ -137,7 +137,7 @@ class Tracker:
         prediction = self.estimator.predict(self.table.states, dt)
         tracked = self.table.associable(prediction.states)
         scene = self.cameras, self.table.markers, prediction.states, tracked
-        association = Association.of(*scene, t_ns, self.limits.sigma_floor_px)
+        association = Association.of(*scene, t_ns)
         return AssociatedFrames(prediction, tracked, association)
 
     def associate(self, associated: AssociatedFrames, frame_set: FrameSet) -> AssociatedFrames:
@@ -209,7 +209,8 @@ class Tracker:
         other.monitors.inherit(self.monitors)
         other.robust.inherit(self.robust)
         other.acquires_none = self.acquires_none
-        other.table.inherit(self.table, renamed)
+        other.rig_response.inherit(self.rig_response, other.table.inherit(self.table, renamed))
+        other.table.claimed = other.rig_response.claimed(other.table.states.P)
         return other
 
     def not_acquired(self) -> dict[str, str]:
@@ -232,21 +233,20 @@ class Tracker:
         frames = tuple(frame for k, frame in enumerate(frame_set.frames) if k not in wrong)
         return association.collect(FrameSet(frame_set.t_ns, frames))
 
+    def _claim(self) -> None:
+        """State the covariances of the robots with the errors of the cameras."""
+        P = self.rig_response.claimed(self.table.states.P, self.robust.added_px2)
+        P[:, :, POSITION] *= self.monitors.rig.widening**0.5
+        P[:, POSITION] *= self.monitors.rig.widening**0.5
+        self.table.claimed = P
+
     def _misses_bodies(self, tracked: Mask) -> bool:
         """Whether a constellation is missing, whose acquisition can displace a single-marker robot."""
         return bool((~tracked & ~self.table.single).any())
 
     def _summarize(self, detections: DetectionTable, assignments: Assignments) -> ObservationSummary:
         table = self.table
-        summary = ObservationSummary.of(
-            self.cameras,
-            table.markers,
-            len(table.robots),
-            self.robust.noisy(detections),
-            assignments,
-            float(np.hypot(self.limits.sigma_floor_px, np.sqrt(self.robust.added_px2))),
-        )
-        return replace(summary, common_error=summary.common_error * self.monitors.rig.widening**0.5)
+        return ObservationSummary.of(self.cameras, table.markers, len(table.robots), detections, assignments)
 
     def _update_states(
         self, associated: AssociatedFrames, detections: DetectionTable, assignments: Assignments
@@ -261,6 +261,8 @@ class Tracker:
         others, assignments = assignments.select(~of_shard), assignments.select(of_shard & are_own)
         fitted = self.robust.update(prediction, detections, assignments)
         self.table.states = fitted.states
+        self.rig_response.update(fitted, self.robust.added_px2)
+        self._claim()
         return fitted.assignments.joined(others)
 
     def _acquire(self, update: Update) -> tuple[Update, Acquired]:
@@ -275,6 +277,14 @@ class Tracker:
         self._reasons = found.reasons
         self.table.adopt(found.rows, found.states)
         self.table.lose(found.displaced)
+        if len(found.rows):
+            mine = np.isin(self.table.markers.robot[found.assignments.marker], found.rows)
+            self.rig_response.restart(
+                self.table.states,
+                found.rows,
+                MatchedObservations.of(found.assignments.select(mine), update.detections, self.table.markers),
+            )
+            self._claim()
         if len(found.assignments) != len(update.assignments):
             self.table.observe(update.t_ns, found.assignments)
         if not len(missing):
@@ -309,6 +319,11 @@ class Tracker:
             camera_use(self.cameras, update.detections, update.assignments, unlabeled.markers),
             update.assignments,
             summary,
-            FilterStep(table.states, update.prediction, update.tracked & table.alive),
+            FilterStep(
+                table.states,
+                update.prediction,
+                update.tracked & table.alive,
+                table.claimed - table.states.P + self.rig_response.counted,
+            ),
             tuple(self.cameras.names[k] for k in crowded.tolist()),
         )

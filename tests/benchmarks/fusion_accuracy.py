@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion.model.frames import FrameSet
-from fusion.model.limits import Limits
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import START_NS, Load
 from tests.fusion.known_filter import KnownFilter
+from tests.fusion.synthetic import precise
 
-LIMITS = Limits(sigma_floor_px=1e-3)
 START = 20  # frame sets for acquisition and for the velocities to converge
 
 
@@ -33,8 +32,9 @@ class Accuracy:
 
 def accuracy(load: Load, seconds: float) -> Accuracy:
     """Of all robots in all frame sets after the start."""
-    tracker = Tracker(load.rig, load.bodies, LIMITS)
-    known = KnownFilter(load.rig, load.bodies, LIMITS, lambda t_ns: load.paths.at((t_ns - START_NS) * 1e-9))
+    cameras = precise(load.rig)
+    tracker = Tracker(cameras, load.bodies)
+    known = KnownFilter(cameras, load.bodies, lambda t_ns: load.paths.at((t_ns - START_NS) * 1e-9))
     mine, theirs, variance, honesty, tracked = [], [], [], [], []
     for k, frame_set in enumerate(frame_sets(load, seconds)):
         tracker.track(frame_set)
@@ -48,7 +48,7 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
         mine.append(np.sum(error[alive] ** 2, 1))
         theirs.append(np.sum((known.states.p - truth.p) ** 2, 1))
         variance.append(np.einsum("nii->n", known.states.P[:, 3:6, 3:6]))
-        honesty.append(_mahalanobis(tracker.table.states.R, truth.R, error, tracker.table.states.P)[alive])
+        honesty.append(_mahalanobis(tracker.table.states.R, truth.R, error, tracker.table.claimed)[alive])
     rms = [1e3 * float(np.sqrt(np.mean(np.concatenate(x)))) for x in (mine, theirs, variance)]
     return Accuracy(
         rms[0], rms[1], rms[2], float(np.mean(np.concatenate(honesty)) / 6), float(np.mean(tracked))

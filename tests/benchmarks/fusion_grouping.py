@@ -41,7 +41,7 @@ def cold_grouping(seed: int, points: int = 130, cameras: int = 10, sigma_px: flo
     frames = tuple(load.frames(1 / load.hz))
     seen = Counter(int(k) for frame in frames for k in frame.roundels.id)
     camera_array = CameraArray(load.rig)
-    detections = DetectionTable.of(FrameSet(frames[0].t_ns, frames), camera_array, 0.0)
+    detections = DetectionTable.of(FrameSet(frames[0].t_ns, frames), camera_array)
     if not sized:
         detections.axes_px[:] = np.nan
     rows, sizes = np.arange(len(detections)), np.array([DIAMETER_M])
@@ -115,7 +115,7 @@ class Scene:
             frames.append(CalibratedFrame.measure(name, 0, roundels, used[name]))
             numbers.append(np.append(seen, np.full(len(false), -1))[order])
         cameras = CameraArray(used)
-        return cameras, DetectionTable.of(FrameSet(0, tuple(frames)), cameras, 0.0), np.concatenate(numbers)
+        return cameras, DetectionTable.of(FrameSet(0, tuple(frames)), cameras), np.concatenate(numbers)
 
     def _calibrated(self, camera: Camera, rng: np.random.Generator) -> Camera:
         error = np.eye(4)
@@ -199,7 +199,7 @@ def moving_markers(
     )
     frames = tuple(arena.frames(1))
     cameras = CameraArray(arena.cameras)
-    table = DetectionTable.of(FrameSet(START_NS, frames), cameras, 0.1)
+    table = DetectionTable.of(FrameSet(START_NS, frames), cameras)
     found = find_markers(cameras, table, np.arange(len(table)), np.array([DISC_M]))
     return found, np.concatenate([frame.roundels.id for frame in frames]), places
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from fusion.model.frames import FrameSet
-from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, DetectionTable, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import States
@@ -24,14 +23,11 @@ class KnownFilter:
     Args:
         cameras: the rig, by name.
         robots: by name.
-        limits: see `Limits`.
         truth: where the filter starts.
     """
 
-    def __init__(
-        self, cameras: dict[str, Camera], robots: dict[str, Robot], limits: Limits, truth: Truth
-    ) -> None:
-        self._tracker, self._limits, self._truth = Tracker(cameras, robots, limits), limits, truth
+    def __init__(self, cameras: dict[str, Camera], robots: dict[str, Robot], truth: Truth) -> None:
+        self._tracker, self._truth = Tracker(cameras, robots), truth
         self._t_ns: int | None = None
         self.states = self._tracker.table.states
 
@@ -43,7 +39,7 @@ class KnownFilter:
         dt = 1e-3 if self._t_ns is None else (frame_set.t_ns - self._t_ns) * 1e-9
         self._t_ns = frame_set.t_ns
         prediction = tracker.estimator.predict(self.states, np.full(len(self.states), dt))
-        detections = DetectionTable.of(frame_set, tracker.cameras, self._limits.sigma_floor_px)
+        detections = DetectionTable.of(frame_set, tracker.cameras)
         number = np.concatenate([frame.roundels.id for frame in frame_set.frames])
         rows = np.flatnonzero(number >= 0)
         assignments = Assignments.of(rows, number[rows].astype(np.intp))

@@ -4,9 +4,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from calib.rig.camera import Camera
+from calib.rig.camera_errors import usual_covariance, working_ranges
 from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections
@@ -38,6 +40,17 @@ def ring(
     return {
         f"cam{k}": Camera(**lens, distortion=distortion, T_world_cam=Pose.from_matrix(T))
         for k, T in enumerate(poses)
+    }
+
+
+def precise(cameras: dict[str, Camera], error_px: float = 1e-3) -> dict[str, Camera]:
+    """The cameras, with covariances that claim this error in the image."""
+    ranges = working_ranges(list(cameras.values())).tolist()
+    return {
+        name: msgspec.structs.replace(
+            camera, covariance=tuple(map(tuple, usual_covariance(camera, range_m, error_px).tolist()))
+        )
+        for (name, camera), range_m in zip(cameras.items(), ranges, strict=True)
     }
 
 

@@ -1,6 +1,10 @@
 // SPDX-License-Identifier: BSD-3-Clause
+#include <nanobind/stl/tuple.h>
+
+#include <algorithm>
+
 #include "arrays.hpp"
-#include "linearization.hpp"
+#include "rig_response.hpp"
 
 namespace roundel::fusion {
 namespace {
@@ -107,6 +111,52 @@ Out shears_of(const Pairs& axes, const Numbers& angle, const Vectors& centre, co
     return both;
 }
 
+auto respond_arrays(const FramePoses& poses, const Index& camera, size_t n_cameras,
+                    const EquationArray& equations, const Numbers& weights, const Numbers& rig_share,
+                    const Index& frame, const Index& body, const Pairs& xy, const Matrices2& whiten,
+                    const Covariances& information, const Covariances& P, const Rotations& T,
+                    const Numbers& dt, const In<double, -1, 12, -1>& responses, const Covariances& counted) {
+    const size_t n = body.size(), n_bodies = poses.n_bodies(), d = kCameraErrors * n_cameras;
+    require_equal(n, {equations.shape(0), weights.size(), rig_share.size(), frame.size()});
+    require_equal(n_bodies, {information.shape(0), P.shape(0), T.shape(0), dt.size(), responses.shape(0),
+                             counted.shape(0)});
+    require_equal(poses.exposures().size(), {camera.size()});
+    require_equal(d, {responses.shape(2)});
+    below(poses.exposures().size(), frame);
+    below(n_cameras, camera);
+    const WeightedEquations observed{
+        {reinterpret_cast<const Equations*>(equations.data()), below(n_bodies, body), n, n_bodies},
+        weights.data(),
+        rig_share.data(),
+        frame.data(),
+        columns<2>(xy, n),
+        columns<4>(whiten, n)};
+    const FilterSteps steps{reinterpret_cast<const ErrorMatrix*>(information.data()),
+                            reinterpret_cast<const ErrorMatrix*>(P.data()), T.data(), dt.data()};
+    auto [S, to_S] = make({n_bodies, kErrors, d});
+    auto [D, to_D] = make({n_bodies, kErrors, kErrors});
+    std::copy_n(responses.data(), responses.size(), to_S);
+    std::copy_n(counted.data(), counted.size(), to_D);
+    unlocked([&, to_S = to_S, to_D = to_D] {
+        respond(poses, observed, steps, camera.data(), n_cameras, to_S, reinterpret_cast<ErrorMatrix*>(to_D));
+    });
+    return std::make_tuple(S, D);
+}
+
+Out consider_arrays(const Covariances& P, const Covariances& counted, const In<double, -1, 12, -1>& responses,
+                    const In<double, -1, -1>& factor) {
+    const size_t n = P.shape(0), d = factor.shape(0);
+    require_equal(n, {counted.shape(0), responses.shape(0)});
+    require_equal(d, {factor.shape(1), responses.shape(2), d / kCameraErrors * kCameraErrors});
+    auto [claimed, to] = make({n, kErrors, kErrors});
+    unlocked([&, to = to] {
+        consider(reinterpret_cast<const ErrorMatrix*>(P.data()),
+                 reinterpret_cast<const ErrorMatrix*>(counted.data()), responses.data(), factor.data(), n, d,
+                 reinterpret_cast<ErrorMatrix*>(to));
+    });
+    return claimed;
+}
+
 }  // namespace
 
 void bind_poses(nb::module_& m) {
@@ -122,6 +172,8 @@ void bind_poses(nb::module_& m) {
         .def("differentiate_by_camera", &differentiate_by_camera)
         .def("linearize_outlines", &linearize_outlines);
     m.def("shears", &shears_of);
+    m.def("respond", &respond_arrays);
+    m.def("consider", &consider_arrays);
 }
 
 }  // namespace roundel::fusion

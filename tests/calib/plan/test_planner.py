@@ -8,14 +8,13 @@ import pytest
 from calib.plan.camera_kind import CameraKind
 from calib.plan.catalogue import CATALOGUE
 from calib.plan.description import ImageQuality, Plan, PlannedRobots
-from calib.plan.expected_error import FLOOR_PX, RoundelSensor, Uncertainty, combine_views, expected_errors
+from calib.plan.expected_error import RoundelSensor, Uncertainty, combine_views, expected_errors
 from calib.plan.planner import PlannedArena, evaluate, message_bytes
 from calib.rig.camera import Camera
 from calib.rig.triangulation import triangulate_point
 from camera_node.foundation.config import load_yaml
 from camera_node.sensor_model.operational_space import Pattern
 from camera_node.sensor_model.visibility import is_detected, is_in_image
-from fusion.model.limits import Limits
 from tests.conftest import ROOT
 
 PLAN = load_yaml(ROOT / "configs" / "plan.yaml", Plan)
@@ -145,10 +144,6 @@ def test_the_load_grows_with_robots_and_a_plan_sums_it():
     report = evaluate(ARENA, 500)
     assert report.network.total_bit_s == pytest.approx(sum(report.network.camera_bit_s.values()))
     assert report.network.fastest_hz == 60.0
-
-
-def test_the_floor_of_the_weights_is_that_of_fusion():
-    assert Limits().sigma_floor_px == FLOOR_PX
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

@@ -36,9 +36,7 @@ def scene(seed: int = 2) -> tuple[States, MatchedObservations]:
         normal=unit_vectors(n, np.random.default_rng(seed + 1)),
         radius=random.uniform(0.02, 0.1, n),
     )
-    return states, MatchedObservations.of_discs(
-        DetectionTable.of(FrameSet(0, tuple(frames)), ARRAY, 0.1), discs
-    )
+    return states, MatchedObservations.of_discs(DetectionTable.of(FrameSet(0, tuple(frames)), ARRAY), discs)
 
 
 def unit_vectors(n: int, random: np.random.Generator) -> np.ndarray:

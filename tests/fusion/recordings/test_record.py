@@ -18,14 +18,13 @@ from camera_node.protocol.messages import encode
 from camera_node.protocol.server_connection import Connection, ServerConnection
 from fusion.commands.record import record
 from fusion.commands.replay import replay
-from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import Robots
 from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder, read_recording
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
 from fusion.tracking.smoothing import Smoother
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
-from tests.fusion.synthetic import TRIANGLE, Arena, line
+from tests.fusion.synthetic import TRIANGLE, Arena, line, precise
 from tests.fusion.tracks import errors, poses_of
 from tests.processes import run_program
 from tests.waiting import DEADLINE_S, repeating, wait_for
@@ -192,10 +191,7 @@ def test_a_recording_rotates_by_time_in_a_fresh_process(tmp_path):
 def smoothed(arena: Arena, smooth: bool, n: int = 18) -> list[TrackingResult]:
     arrivals = [(message.t_ns, message) for message in arena.messages(n)]
     arrivals.sort(key=lambda arrival: arrival[0])
-    limits = Limits(sigma_floor_px=1e-3)
-    return list(
-        fuse_recording(arrivals, OfflineArena(arena.cameras, arena.robots, limits=limits, smooth=smooth))
-    )
+    return list(fuse_recording(arrivals, OfflineArena(precise(arena.cameras), arena.robots, smooth=smooth)))
 
 
 @pytest.mark.computed

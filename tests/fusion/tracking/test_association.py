@@ -61,7 +61,7 @@ def test_of_two_markers_in_line_the_one_of_the_measured_size_is_assigned(measure
     seen = Roundels(
         seen.uv, seen.cov, np.full((1, 2), major), np.zeros(1), seen.ratio, seen.contrast, seen.id, seen.track
     )
-    association = Association.of(cameras, marker_table, states, np.ones(2, bool), 0, 0.1)
+    association = Association.of(cameras, marker_table, states, np.ones(2, bool), 0)
     frame_set = FrameSet(0, (CalibratedFrame.measure("cam0", 0, seen, camera),))
     assignments = association.extended(frame_set.frames).collect(frame_set)[1]
     assert marker_table.robot[assignments.marker].tolist() == [measured]

@@ -1,53 +1,70 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Published positions claim the error of the calibration, which is the same for all markers in a view."""
-
-from dataclasses import replace
-from itertools import groupby
+"""Published poses claim the errors of the rig: over many calibrations and places, not along one run."""
 
 import msgspec
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from calib.rig.camera import Camera
+from calib.rig.camera_errors import ERRORS, error_covariance
+from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.limits import Limits
-from fusion.model.robots import Robot
-from fusion.protocol.pose_messages import RobotPose
+from fusion.model.observations import CameraArray
 from fusion.tracking.tracker import Tracker
-from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, circle
+from tests.benchmarks.fusion_load import START_NS, Load, Scene
 
-FLOOR_PX = Limits().sigma_floor_px
-RIGS, FRAMES = 8, 4
-
-
-def displaced(frame: CalibratedFrame, camera: Camera, shift: np.ndarray) -> CalibratedFrame:
-    """The frame of a camera that is calibrated with an error of `shift` (2,), pixels."""
-    moved = replace(frame.roundels, uv=frame.roundels.uv + shift)
-    return CalibratedFrame.measure(frame.camera, frame.t_ns, moved, camera)
+RIGS, FRAMES, HZ = 30, 8, 30.0
+FALSE_ALARM = 1e-3  # of one test
 
 
-def squared_error(robot: Robot, rng: np.random.Generator) -> float:
-    """Of the last position of a robot in front of cameras with errors, over its claim, for each coordinate."""
-    arena = Arena({"robot": robot}, {"robot": circle(1e9, 0.4)}, phases=(0.0,) * 4, sigma_px=0.005)
-    shifts = {name: FLOOR_PX * rng.standard_normal(2) for name in arena.cameras}
-    tracker = Tracker(arena.cameras, arena.robots)
-    poses: list[RobotPose] = []
-    for t_ns, frames in groupby(arena.frames(FRAMES), lambda frame: frame.t_ns):
-        seen = tuple(displaced(f, arena.cameras[f.camera], shifts[f.camera]) for f in frames)
-        poses = list(tracker.track(FrameSet(t_ns, seen)).poses)
-    pose = poses[0]
-    error = np.array(pose.position) - arena.truth("robot", pose.t_ns)[1]
-    return float(error @ np.linalg.solve(pose.covariance_matrix[3:6, 3:6], error)) / 3
+def drawn(cameras: dict[str, Camera], rng: np.random.Generator) -> dict[str, Camera]:
+    """True cameras, of which the given ones are a calibration with the covariance that they state."""
+    covariance = error_covariance(list(cameras.values()))
+    errors = rng.multivariate_normal(np.zeros(len(covariance)), covariance).reshape(-1, ERRORS)
+    true = {}
+    for error, (name, camera) in zip(errors, cameras.items(), strict=True):
+        T = camera.matrix()
+        T[:3, 3] += T[:3, :3] @ error[3:6]
+        T[:3, :3] = T[:3, :3] @ rotation_from_vector(error[:3])
+        true[name] = msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
+    return true
+
+
+def stated(cameras: dict[str, Camera], turn_rad: float, shift_m: float) -> dict[str, Camera]:
+    """Cameras that state these standard deviations of their poses."""
+    covariance = tuple(map(tuple, np.diag(np.repeat([turn_rad, shift_m], 3) ** 2).tolist()))
+    return {n: msgspec.structs.replace(c, covariance=covariance) for n, c in cameras.items()}
+
+
+def squared_error(load: Load, cameras: dict[str, Camera], rng: np.random.Generator) -> float:
+    """Of the last position of a moving robot by cameras with errors, over its claim: chi-square with 3 degrees."""
+    scene, (name, robot) = Scene(load), next(iter(load.bodies.items()))
+    scene.cameras = CameraArray(drawn(cameras, rng))
+    start = tuple(load.paths.at(0.0).p[0].tolist())
+    tracker = Tracker(cameras, {name: msgspec.structs.replace(robot, start_m=start)})
+    for seq in range(FRAMES):
+        stamps = (seq + load.phases()) / HZ
+        messages = [scene.detect(k, seq, float(t), rng) for k, t in enumerate(stamps)]
+        frames = tuple(CalibratedFrame.of(message, cameras[message.camera]) for message in messages)
+        tracker.track(FrameSet(START_NS + round(seq / HZ * 1e9), frames))
+    assert tracker.table.tracked.all()
+    error = tracker.table.states.p[0] - load.paths.at((FRAMES - 1) / HZ).p[0]
+    return float(error @ np.linalg.solve(tracker.table.claimed[0, 3:6, 3:6], error))
 
 
 @pytest.mark.parametrize(
-    "robot",
-    [msgspec.structs.replace(SINGLE, start_m=(0.4, 0.0, 0.2)), TRIANGLE],
-    ids=["one marker", "three markers"],
+    ("markers", "sigma_px", "states_errors"),
+    [(1, 0.1, True), (4, 0.1, False), (4, 0.01, True)],
+    ids=["one marker", "four markers, of a rig that states nothing", "a precise detector"],
 )
-def test_errors_that_all_markers_of_a_view_share_are_claimed(robot: Robot):
-    """The mean over rigs is 1, with a standard deviation of sqrt(2 / 3 RIGS) = 0.3; within four of these. Where markers
-    count as independent, three of them have 3."""
+def test_the_errors_of_the_rig_are_claimed(markers: int, sigma_px: float, states_errors: bool):
+    """The sum over rigs and places is chi-square with 3 degrees of freedom for each."""
     rng = np.random.default_rng(6)
-    mean = np.mean([squared_error(robot, rng) for _ in range(RIGS)])
-    assert mean == pytest.approx(1.0, abs=4 * (2 / (3 * RIGS)) ** 0.5)
+    squares = []
+    for seed in range(RIGS):
+        load = Load(1, markers, 4, HZ, 0.5, 0.1, 0.0, sigma_px=sigma_px, crossing=True, seed=seed)
+        cameras = stated(load.rig, 2e-4, 1e-3) if states_errors else load.rig
+        squares.append(squared_error(load, cameras, rng))
+    low, high = chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 3 * RIGS)
+    assert low < np.sum(squares) < high, np.mean(squares) / 3

@@ -124,7 +124,7 @@ def test_no_detection_is_in_two_markers():
         for name, seen in zip(cameras, noise, strict=True)
     ]
     camera_array = CameraArray(cameras)
-    detections = DetectionTable.of(FrameSet(0, tuple(frames)), camera_array, 0.0)
+    detections = DetectionTable.of(FrameSet(0, tuple(frames)), camera_array)
     markers = find_markers(camera_array, detections, np.arange(len(detections)), np.array([0.12]))
     taken = np.concatenate([marker.detections for marker in markers])
     assert len(np.unique(taken)) == len(taken)

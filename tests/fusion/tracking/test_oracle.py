@@ -81,7 +81,7 @@ def observed(
         radius=np.full(n * k, 1e-6),
     )
     return MatchedObservations.of_discs(
-        DetectionTable.of(FrameSet(0, tuple(frames)), CameraArray(CAMERAS), 0.0), discs
+        DetectionTable.of(FrameSet(0, tuple(frames)), CameraArray(CAMERAS)), discs
     )
 
 

@@ -71,7 +71,7 @@ def moving_disc(velocity: tuple[float, float, float]) -> tuple[Arena, States, Ma
     cameras, markers = CameraArray(arena.cameras), MarkerTable.of([SINGLE])
     R, p = arena.truth("a", frames[0].t_ns)
     states = States(R[None], p[None], np.zeros((1, 3)), np.array([velocity]), np.eye(12)[None])
-    table = DetectionTable.of(FrameSet(frames[0].t_ns, tuple(frames)), cameras, 0.1)
+    table = DetectionTable.of(FrameSet(frames[0].t_ns, tuple(frames)), cameras)
     rows = np.zeros(len(table), np.intp)
     return arena, states, MatchedObservations.of_discs(table, markers.discs(rows, table.frame))
 

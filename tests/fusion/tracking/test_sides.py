@@ -14,7 +14,6 @@ from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_ro
 from camera_node.simulation.renderer import Renderer
 from camera_node.simulation.scene import Scene
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.limits import Limits
 from fusion.model.observations import CameraArray, DetectionTable, Exposures, MarkerTable
 from fusion.model.robots import Robot, load_robots
 from fusion.model.states import States
@@ -23,12 +22,11 @@ from fusion.tracking.result import TrackingResult
 from fusion.tracking.tracker import Tracker
 from tests.conftest import ROOT
 from tests.fusion.known_filter import KnownFilter
-from tests.fusion.synthetic import PERIOD_NS, START_NS, TRIANGLE, Arena, line, ring
+from tests.fusion.synthetic import PERIOD_NS, START_NS, TRIANGLE, Arena, line, precise, ring
 from tests.fusion.tracks import errors, poses_of
 
 CUBE = load_robots(ROOT / "configs" / "robots_cube.yaml")["cube"]
 FLAT = Robot(diameter_m=CUBE.diameter_m, markers=TRIANGLE.markers)
-TIGHT = Limits(sigma_floor_px=1e-3)
 DETECTABLE = 0.2  # cosine of the slant of 78 degrees
 SETTLED = 20  # frame sets for the velocities to converge
 SWAPPED_M = 0.02  # markers are 90 mm apart or more, so a wrong marker moves or turns the cube by more
@@ -83,8 +81,8 @@ def test_a_tumbling_cube_is_tracked_within_the_bound():
     """Four cameras, 8 s, in which each side turns away from all cameras several times. The position errors are within
     1.15 times the bound of a filter that knows all associations, and within 1.15 times its errors."""
     arena = cube_arena()
-    tracker = Tracker(arena.cameras, arena.robots, TIGHT)
-    known = KnownFilter(arena.cameras, arena.robots, TIGHT, lambda t_ns: true_states(arena, t_ns))
+    tracker = Tracker(precise(arena.cameras), arena.robots)
+    known = KnownFilter(precise(arena.cameras), arena.robots, lambda t_ns: true_states(arena, t_ns))
     results, bound, best = [], [], []
     for frame_set in frame_sets(arena, 240):
         results.append(tracker.track(frame_set))
@@ -105,7 +103,7 @@ def test_a_cube_is_acquired_at_once_and_never_at_a_wrong_pose():
     begun = []
     for seed in range(15):
         arena = cube_arena(seed, 7.3 * seed, distractors=3)
-        tracker = Tracker(arena.cameras, arena.robots, TIGHT)
+        tracker = Tracker(precise(arena.cameras), arena.robots)
         results = [tracker.track(frame_set) for frame_set in frame_sets(arena, 12)]
         assert wrong_poses(arena, results) == 0
         begun.append(next(k for k, result in enumerate(results) if result.poses))
@@ -121,7 +119,7 @@ def test_a_cube_and_a_flat_robot_are_not_exchanged():
         sigma_px=0.1,
         min_facing=DETECTABLE,
     )
-    tracker = Tracker(arena.cameras, arena.robots, TIGHT)
+    tracker = Tracker(precise(arena.cameras), arena.robots)
     results = [tracker.track(frame_set) for frame_set in frame_sets(arena, 45)]
     assert wrong_poses(arena, results) == 0
     flat = [pose for pose in poses_of(results, "flat") if pose.state == "tracked"]
@@ -138,7 +136,7 @@ def test_one_side_keeps_a_cube_tracked():
         hidden=lambda robot, marker, t: t > 0.5 and marker > 2,
         min_facing=DETECTABLE,
     )
-    tracker = Tracker(arena.cameras, arena.robots, TIGHT)
+    tracker = Tracker(precise(arena.cameras), arena.robots)
     results = [tracker.track(frame_set) for frame_set in frame_sets(arena, 40)]
     late = poses_of(results, "cube")[-10:]
     assert {(pose.state, pose.n_markers) for pose in late} == {("tracked", 3)}
@@ -154,7 +152,7 @@ def test_a_mostly_covered_cube_is_not_acquired_and_says_why():
         hidden=lambda robot, marker, t: marker > 2,
         min_facing=DETECTABLE,
     )
-    tracker = Tracker(arena.cameras, arena.robots, TIGHT)
+    tracker = Tracker(precise(arena.cameras), arena.robots)
     results = [tracker.track(frame_set) for frame_set in frame_sets(arena, 12)]
     assert poses_of(results, "cube") == []
     assert tracker.not_acquired()["cube"].startswith("some of its markers fit, but the cameras do not detect")
@@ -162,7 +160,7 @@ def test_a_mostly_covered_cube_is_not_acquired_and_says_why():
 
 def test_published_markers_have_the_normals_of_their_sides():
     arena = cube_arena()
-    tracker = Tracker(arena.cameras, arena.robots, TIGHT)
+    tracker = Tracker(precise(arena.cameras), arena.robots)
     last = [tracker.track(frame_set) for frame_set in frame_sets(arena, 10)][-1]
     R, _ = arena.truth("cube", last.t_ns)
     number = np.frombuffer(last.markers.marker, "<i4")
@@ -215,7 +213,7 @@ def test_only_prints_that_face_a_camera_are_candidates():
     axes = np.column_stack([major, major / 2])
     roundels = replace(Roundels.from_points(uv, 0.1), axes_px=axes)
     frame_set = FrameSet(0, (CalibratedFrame.measure("cam0", 0, roundels, camera),))
-    detections = DetectionTable.of(frame_set, cameras, 0.0)
+    detections = DetectionTable.of(frame_set, cameras)
     pairs, _ = table.expected(rows, states).candidates(
         cameras.frame_poses(states, exposures), detections.columns, cameras.focal[[0]]
     )

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from fusion.model.frames import CalibratedFrame
-from fusion.model.limits import Limits
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
-from tests.fusion.synthetic import PERIOD_NS, SINGLE, TRIANGLE, WIDE, Arena, line
+from tests.fusion.synthetic import PERIOD_NS, SINGLE, TRIANGLE, WIDE, Arena, line, precise
 from tests.fusion.tracks import errors, poses_of, track
 
-TIGHT = Limits(sigma_floor_px=1e-3)
 MOVING = line((0.2, -0.3, 0.4), velocity=(0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0), tilt=(0.1, -0.2, 0.4))
 
 
@@ -22,7 +20,7 @@ def test_exact_without_noise_with_free_running_cameras(run_arena, motion):
     """The model includes uniform motion. The remaining errors come from linearization and from the affine lens over a
     disc: the centre of a distorted ellipse is 1e-3 px off."""
     arena = Arena({"a": TRIANGLE}, {"a": motion})
-    _, poses = run_arena(arena, limits=TIGHT)
+    _, poses = run_arena(replace(arena, cameras=precise(arena.cameras)))
     late = poses("a")[10:]
     error = errors(arena, late)
     assert len(late) >= 19
@@ -50,7 +48,7 @@ def test_published_covariance_matches_the_errors():
     squares, positions = [], []
     for seed in range(60):
         arena = Arena({"a": TRIANGLE}, {"a": MOVING}, sigma_px=0.1, seed=seed)
-        pose = track(arena, arena.frames(5), Limits(sigma_floor_px=1e-3))[-2].poses[0]
+        pose = track(replace(arena, cameras=precise(arena.cameras)), arena.frames(5))[-2].poses[0]
         e, P = errors(arena, [pose])[0], pose.covariance_matrix
         squares.append(e @ np.linalg.solve(P[:6, :6], e))
         positions.append(e[3:] @ np.linalg.solve(P[3:6, 3:6], e[3:]))
@@ -119,7 +117,11 @@ def test_covariance_matches_the_errors_from_the_first_pose_on(cameras):
             hidden=lambda robot, marker, t: 0.2 < t < 0.6,
         )
         frames = [f for f in arena.frames(26) if cameras == 4 or f.camera in ("cam0", "cam2")]
-        poses = [pose for result in track(arena, frames, TIGHT) for pose in result.poses]
+        poses = [
+            pose
+            for result in track(replace(arena, cameras=precise(arena.cameras)), frames)
+            for pose in result.poses
+        ]
         before = ["lost", *(pose.state for pose in poses)]
         found = [p for was, p in zip(before, poses, strict=False) if was == "lost" != p.state]
         assert len(found) == 2
@@ -175,7 +177,7 @@ def test_an_unlabeled_marker_has_position_velocity_and_normal(speed: float):
         motion = line((-0.1, 0.1, 0.3), velocity=(speed, -speed / 2, 0.1 * speed), tilt=(0.2, 0.1, 0.0))
         arena = Arena({"x": SINGLE}, {"x": motion}, sigma_px=0.1, seed=seed)
         tracker, synchronizer = (
-            Tracker(arena.cameras, {"other": TRIANGLE}, TIGHT),
+            Tracker(precise(arena.cameras), {"other": TRIANGLE}),
             FrameSynchronizer(33_333_333),
         )
         for frame in arena.frames(10):
@@ -230,7 +232,7 @@ def test_late_frames_are_used_and_the_covariance_covers_them():
     squares = []
     for seed in range(12):
         arena = Arena({"a": TRIANGLE}, {"a": circle}, sigma_px=0.1, seed=seed)
-        tracker, closed = Tracker(arena.cameras, arena.robots, TIGHT), []
+        tracker, closed = Tracker(precise(arena.cameras), arena.robots), []
         synchronizer = FrameSynchronizer(33_333_333, 60_000_000)
         arrivals = [(f.t_ns + (100_000_000 if f.camera == "cam1" else 0), f) for f in arena.frames(14)]
         for now_ns, frame in sorted(arrivals, key=lambda arrival: arrival[0]):

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Claims that contain the errors of the cameras: consider parameters (Schmidt 1966; Bierman 1977, section VIII.4).
+
+The filter holds the cameras fixed. To weigh detections by what they are worth, it counts errors of the cameras as noise
+of each detection. But they are the same in all detections of a camera and in all frame sets, so that neither markers
+nor time average them. For each robot, two quantities follow the steps of the filter, with P' its prediction, P after
+the update, F the transition, A and B the whitened derivatives of the detections by robot and cameras, w their weights,
+and E = P P'^-1 = I - K A:
+
+    response of its errors to those of the cameras     S <- E F S - P sum w A^T B
+    the part of P that counts the cameras as noise     D <- E F D F^T E^T + P (sum s w A^T A) P
+
+with s the part of a detection's variance that is the cameras'. The claimed covariance is P - D + S R S^T, with R that
+of the cameras. It is exact for any gain, so also for robust weights. docs/design/fusion_filter.md has the equations.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from calib.rig.camera_errors import ERRORS
+from camera_node.foundation.arrays import Array, Index
+from fusion import _core
+from fusion.model.observations import MatchedObservations
+from fusion.model.states import States, Transition
+from fusion.tracking.estimator import Estimator
+from fusion.tracking.robust_update import RobustFit
+
+REGULAR = 1e-12  # share of a variance that keeps the factor of a singular covariance regular
+
+
+class RigResponse:
+    """The responses of N robots to errors of the cameras.
+
+    Args:
+        estimator: of the robots.
+
+    Attributes:
+        responses: (N, 12, 8 C) derivatives of the errors of the states by those of the cameras.
+        counted: (N, 12, 12) parts of the filter's covariances that count the errors of cameras as noise.
+    """
+
+    def __init__(self, estimator: Estimator) -> None:
+        self._estimator, self._cameras, n = estimator, estimator.cameras, len(estimator.single)
+        self.responses = np.zeros((n, 12, ERRORS * len(self._cameras.names)))
+        self.counted = np.zeros((n, 12, 12))
+        self._factor, self._factor_of = np.zeros((0, 0)), (-1, 0.0)
+
+    def inherit(self, old: "RigResponse", same: Mapping[int, int]) -> None:
+        """Continue with the robots of another one, whose rows `same` has by row."""
+        rows, before = list(same), list(same.values())
+        self.responses[rows], self.counted[rows] = old.responses[before], old.counted[before]
+
+    def update(self, fitted: RobustFit, added_px2: float) -> None:
+        """Follow a step of the filter.
+
+        Args:
+            fitted: of all robots.
+            added_px2: variance that the detections of a camera have in common beside the calibration's error.
+        """
+        prediction, equations = fitted.prediction, (fitted.equations, fitted.weights)
+        self._follow(
+            fitted.states,
+            fitted.observations,
+            equations,
+            (prediction.information, prediction.motion),
+            added_px2,
+        )
+
+    def restart(self, states: States, rows: Index, observations: MatchedObservations) -> None:
+        """Robots (rows) that these observations located, without a prediction.
+
+        Args:
+            states: of all robots, after the observations.
+            rows: the robots.
+            observations: of these only.
+        """
+        self.responses[rows], self.counted[rows] = 0.0, 0.0
+        A, nu = self._estimator.innovations(states, observations)
+        equations = np.concatenate([A, nu[:, None]], 1).reshape(-1, 2, 13)
+        weights = 1 / (_core.NOMINAL_WEIGHT * (1 + np.sum(equations[:, :, 12] ** 2, 1) / _core.CAUCHY**2))
+        n = len(states)
+        at_rest = Transition(np.zeros((n, 3, 3)), np.zeros(n))
+        self._follow(states, observations, (equations, weights), (np.zeros((n, 12, 12)), at_rest), 0.0)
+
+    def _follow(
+        self,
+        states: States,
+        observations: MatchedObservations,
+        linearized: tuple[Array, Array],
+        predicted: tuple[Array, Transition],
+        added_px2: float,
+    ) -> None:
+        """Update by the equations (N, 2, 13) and weights (N,) of observations, and by the information (R, 12, 12) of
+        the predictions and the transition to them; robots without observations are predicted."""
+        seen, (information, motion) = observations.detections, predicted
+        camera = seen.exposures.camera
+        rig_px2 = self._cameras.error_px[camera[seen.frame]] ** 2 + added_px2
+        self.responses, self.counted = _core.respond(
+            self._cameras.frame_poses(states, seen.exposures),
+            camera,
+            len(self._cameras.names),
+            *linearized,
+            2 * rig_px2 / (seen.cov[0, 0] + seen.cov[1, 1]),
+            seen.frame,
+            observations.discs.body,
+            seen.xy,
+            observations.whiten,
+            information,
+            states.P,
+            motion.T,
+            motion.dt,
+            self.responses,
+            self.counted,
+        )
+
+    def claimed(self, P: Array, added_px2: float = 0.0) -> Array:
+        """(N, 12, 12) covariances of the robots that contain the errors of the cameras.
+
+        Args:
+            P: (N, 12, 12) the filter's.
+            added_px2: see `update`.
+        """
+        return _core.consider(P, self.counted, self.responses, self._factor_with(added_px2))
+
+    def _factor_with(self, added_px2: float) -> Array:
+        """(8 C, 8 C) lower triangular factor of the covariance of the cameras, each turned by `added_px2` besides."""
+        key = self._cameras.revision, added_px2
+        if key != self._factor_of:
+            covariance = self._cameras.covariance.copy()
+            turns = np.flatnonzero(np.arange(len(covariance)) % ERRORS < 2)
+            covariance[turns, turns] += added_px2 / self._cameras.focal[turns // ERRORS] ** 2
+            diagonal = np.diag_indices(len(covariance))
+            covariance[diagonal] += REGULAR * covariance[diagonal] + np.finfo(float).tiny ** 0.5
+            self._factor, self._factor_of = np.asarray(np.linalg.cholesky(covariance), float), key
+        return self._factor
