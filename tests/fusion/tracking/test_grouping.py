@@ -121,7 +121,7 @@ def test_rays_of_several_discs_that_motion_lets_meet_make_no_marker(apart_m: flo
 
 def test_a_marker_that_appears_is_found_soon_although_no_robot_is_missing():
     """Detections of one frame set are not searched without a cause; those that stay are one."""
-    load = Load(2, 4, 4, 30.0, missing=0.0, false=0.0)
+    load = Load(2, 4, 4, 30.0, missing=0.0)
     both = zip(frame_sets(load, 1.2), frame_sets(replace(load, clutter=1), 1.2), strict=True)
     tracker, found = Tracker(load.rig, load.bodies), []
     for k, (without, with_marker) in enumerate(both):
