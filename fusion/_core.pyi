@@ -124,8 +124,11 @@ class MarkerCloud:
         are none.
         """
 
-def look_up(cells: Array, cell_px: float, uv: Array, axes: Array, angle: Array, /) -> tuple[Array, Array]:
-    """(2, N) centres of undistorted ellipses, and (2, 2, N) Jacobians of pixels by undistorted coordinates.
+def are_outlines(axes: Array, angle: Array, low: float, high: float, /) -> NDArray[np.bool_]:
+    """(N,) whether full axes (N, 2) and directions (N,) are those of outlines with axes from `low` to `high` px."""
+
+def look_up(cells: Array, cell_px: float, uv: Array, axes: Array, angle: Array, /) -> Array:
+    """(6, N) centres of undistorted ellipses, and Jacobians (2, 2) of pixels by undistorted coordinates.
 
     uv and axes (N, 2), angle (N,); axes may be NaN. cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`.
     """

@@ -5,6 +5,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "bind_lens.hpp"
+#include "bind_messages.hpp"
 #include "code/code_book.hpp"
 #include "detector.hpp"
 #include "frame_columns.hpp"
@@ -68,6 +69,7 @@ static nb::object explain(roundel::Detector& detector, const GreyImage& image) {
 
 NB_MODULE(_core, m) {
     bind_lens(m);
+    bind_messages(m);
     m.attr("CODE_SECTORS") = roundel::kCodeSectors;
     m.attr("CODE_RADII") = nb::make_tuple(roundel::kCodeInner, roundel::kCodeOuter);
     m.def("code_words", [] { return roundel::code_words(); });

@@ -8,6 +8,7 @@ from typing import ClassVar, TypeVar
 import msgspec
 import numpy as np
 
+from camera_node import _core
 from camera_node.detection.roundels import DIAMETERS_M, LocatedRoundels, Roundels
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import is_name, require_name
@@ -172,21 +173,26 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
         columns["cov"] = roundels.cov.reshape(-1, 4)[:, [0, 1, 3]]
         return cls(**cls._to_bytes(columns), **header)
 
-    @np.errstate(invalid="ignore")  # the conversion turns signalling NaNs into quiet ones
     def unpack(self) -> Roundels:
         """Convert the columns to arrays."""
-        columns = {name: self._column(name) for name in self.COLUMNS}
-        columns["cov"] = columns["cov"][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        return Roundels(**columns)
+        columns = self.uv, self.cov, self.axes_px, self.angle_rad, self.ratio, self.contrast
+        n, numbers = len(self), _core.unpack_detections(*columns)
+        return Roundels(
+            numbers[: 2 * n].reshape(n, 2),
+            numbers[2 * n : 6 * n].reshape(n, 2, 2),
+            numbers[6 * n : 8 * n].reshape(n, 2),
+            numbers[8 * n : 9 * n],
+            numbers[9 * n : 10 * n],
+            numbers[10 * n :],
+            np.frombuffer(self.id, I4),
+            np.frombuffer(self.track, I4),
+        )
 
-    @np.errstate(invalid="ignore")  # as in `unpack`
     def check(self) -> None:
         """Raise MessageError unless sizes agree, centres are finite and covariances positive definite and small."""
         self._check_sizes()
         self._check_header()
-        uu, uv, vv = self._column("cov").T  # comparisons with NaN are False
-        valid = (uu > 0) & (uu < MAX_VARIANCE_PX2) & (vv < MAX_VARIANCE_PX2) & (uu * vv > uv * uv)
-        if not (valid.all() and (np.abs(self._column("uv")) < 1e5).all()):
+        if not _core.are_plausible(self.uv, self.cov, MAX_VARIANCE_PX2):
             raise MessageError("a centre or a covariance is NaN or out of range")
 
     def _check_header(self) -> None:

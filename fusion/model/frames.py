@@ -45,12 +45,14 @@ class CalibratedFrame:
     readout_s: float = 0.0
 
     @classmethod
-    def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "CalibratedFrame":
-        """The frame of a message from a calibrated camera."""
+    def of(
+        cls, message: Detections, camera: Camera, received_ns: int = 0, roundels: Roundels | None = None
+    ) -> "CalibratedFrame":
+        """The frame of a message from a calibrated camera; `roundels` in place of those of the message."""
         return cls.measure(
             message.camera,
             camera.capture_ns(message.t_ns, message.sent_ns),
-            message.unpack(),
+            message.unpack() if roundels is None else roundels,
             camera,
             stamp_ns=message.t_ns,
             sent_ns=message.sent_ns,

@@ -108,7 +108,8 @@ class UndistortionTable:
     def look_up(self, ellipses: RawEllipses) -> tuple[Array, Array]:
         """See `undistort`; NaN in empty cells."""
         columns = ellipses.uv, ellipses.axes_px, ellipses.angle_rad
-        return _core.look_up(self.coefficients, self.cell_px, *map(np.ascontiguousarray, columns))
+        both = _core.look_up(self.coefficients, self.cell_px, *map(np.ascontiguousarray, columns))
+        return both[:2], both[2:].reshape(2, 2, -1)
 
 
 def _monomials(st: Array) -> Array:

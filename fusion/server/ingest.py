@@ -17,6 +17,7 @@ from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from camera_node.protocol.publishers import Publishers
+from fusion import _core
 from fusion.model.frames import CalibratedFrame
 from fusion.server.server_statistics import ServerStatistics
 
@@ -49,8 +50,8 @@ def admit(
     """
     if (refused := refusal(message, cameras)) is not None:
         return refused
-    frame = CalibratedFrame.of(message, cameras[message.camera], received_ns)
-    frame = replace(frame, roundels=_with_plausible_outlines(frame.roundels))
+    roundels = _with_plausible_outlines(message.unpack())
+    frame = CalibratedFrame.of(message, cameras[message.camera], received_ns, roundels)
     return _with_strongest(frame) if len(frame.roundels) > MAX_DETECTIONS else frame
 
 
@@ -164,9 +165,7 @@ class Ingest:
 
 def _with_plausible_outlines(roundels: Roundels) -> Roundels:
     """The roundels, with NaN for the axes and the angle of each impossible outline."""
-    low, high = AXES_PX
-    minor, major = roundels.axes_px[:, 1], roundels.axes_px[:, 0]
-    good = (minor > low) & (minor <= major * 1.001) & (major < high) & np.isfinite(roundels.angle_rad)
+    good = _core.are_outlines(roundels.axes_px, roundels.angle_rad, *AXES_PX)
     if good.all():
         return roundels
     axes_px = np.where(good[:, None], roundels.axes_px, np.nan)

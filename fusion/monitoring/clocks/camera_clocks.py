@@ -10,12 +10,11 @@ See docs/design/time_offsets.md.
 """
 
 import logging
+import math
 import time
 from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Literal
-
-import numpy as np
 
 from camera_node.foundation.arrays import Mask
 from camera_node.foundation.logs import about
@@ -97,6 +96,7 @@ class CameraClocks:
         self._arrivals = ArrivalMonitor(cameras.names)
         self._comparison = ClockComparison(cameras, markers, single)
         self._now_ns = 0
+        self._has_jumped = True  # by arrivals, a camera at the last frame
 
     @property
     def excluded(self) -> set[str]:
@@ -120,8 +120,9 @@ class CameraClocks:
         self._arrivals.observe(frame.camera, frame.t_ns, frame.received_ns)
         self._correct_all(self._arrivals.impossible_ns)
         self._exclude_jumped(frame.received_ns)
-        sigma_s = float(np.hypot(frame.clock_sigma_s, clock.sigma_s))
-        frame = replace(frame, t_ns=frame.t_ns + clock.correction_ns, clock_sigma_s=sigma_s)
+        if clock.correction_ns or clock.sigma_s:
+            sigma_s = math.hypot(frame.clock_sigma_s, clock.sigma_s)
+            frame = replace(frame, t_ns=frame.t_ns + clock.correction_ns, clock_sigma_s=sigma_s)
         if clock.state == "excluded":
             clock.frames.append(frame)
             if frame.received_ns > clock.since_ns + ALONE_NS:
@@ -167,6 +168,9 @@ class CameraClocks:
     def _exclude_jumped(self, now_ns: int) -> None:
         """Exclude the cameras whose stamps jumped relative to the others, or may have, and use those whose did not."""
         jumped = self._arrivals.jumped | self._arrivals.undecided
+        if not (jumped or self._has_jumped):
+            return
+        self._has_jumped = bool(jumped)  # the next frame readmits the last ones
         for name, clock in self._clocks.items():
             if clock.state == "excluded":
                 if clock.by_arrival and name not in jumped:

@@ -69,6 +69,20 @@ auto candidates(const ExpectedMarkers& markers, const FramePoses& poses, const D
     return std::make_tuple(pairs, costs);
 }
 
+/// (N,) whether full axes (N, 2) and the direction of the first one are those of an outline with axes in a
+/// range.
+auto are_outlines(const In<double, -1, 2>& axes, const Numbers& angle, double low, double high) {
+    constexpr double kRounding = 1.001;  // of the axes of a circle, as floats of another program
+    const size_t n = angle.size();
+    require_equal(n, {axes.shape(0)});
+    auto [all, to] = make<bool>({n});
+    for (size_t k = 0; k < n; ++k) {
+        const double major = axes(k, 0), minor = axes(k, 1);
+        to[k] = minor > low && minor <= kRounding * major && major < high && std::isfinite(angle(k));
+    }
+    return all;
+}
+
 auto look_up_outlines(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv,
                       const In<double, -1, 2>& axes, const Numbers& angle) {
     if (cells.shape(0) < 3 || cells.shape(1) < 3) throw nb::value_error("a table without cells");
@@ -76,10 +90,9 @@ auto look_up_outlines(const In<double, -1, -1, 20>& cells, double cell_px, const
     const size_t n = uv.shape(0);
     require_equal(n, {axes.shape(0), angle.size()});
     const Outlines seen{uv.data(), axes.data(), angle.data(), n};
-    auto [xy, to_xy] = make({2, n});
-    auto [scale, to_scale] = make({2, 2, n});
-    unlocked([&, a = to_xy, b = to_scale] { look_up(lens, seen, a, b); });
-    return std::make_tuple(xy, scale);
+    auto [both, to] = make({6, n});
+    unlocked([&, xy = to, scale = to + 2 * n] { look_up(lens, seen, xy, scale); });
+    return both;
 }
 
 }  // namespace
@@ -93,6 +106,7 @@ void bind_detections(nb::module_& m) {
         .def("__init__", &make_expected)
         .def("covariances", &covariances)
         .def("candidates", &candidates);
+    m.def("are_outlines", &are_outlines);
     m.def("look_up", &look_up_outlines);
 }
 
