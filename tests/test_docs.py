@@ -26,6 +26,7 @@ from tests.web.roundel.programs import Program, roundel, roundel_command
 
 # The tests that run the commands of a page which are not in the README.
 TESTED = {
+    "benchmark.md": "tests/fusion/recordings/test_record.py",
     "recordings.md": "tests/fusion/recordings/test_recordings_page.py",
     "clients.md": "tests/examples/test_clients.py",
     "bridges.md": "tests/fusion/bridges/test_bridges_page.py",

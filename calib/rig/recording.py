@@ -83,7 +83,8 @@ class RecordingWriter:
         """Append a message that arrived on a key."""
         try:
             if key not in self._channels:
-                self._channels[key] = self._writer.register_channel(key, "msgpack", 0)
+                encoding = "jpeg" if key.endswith("/snapshot") else "msgpack"
+                self._channels[key] = self._writer.register_channel(key, encoding, 0)
             self._writer.add_message(self._channels[key], received_ns, data, received_ns, self.counts[key])
             self._pending += len(data)
             if self._pending >= self._chunk:

@@ -19,6 +19,7 @@ def record(
     seconds: float | None = None,
     rotate_mb: float | None = None,
     rotate_minutes: float | None = None,
+    public: bool = False,
     force: bool = False,
 ) -> int:
     """Record an arena's detections, poses, markers, rig and robots, until stopped.
@@ -29,6 +30,8 @@ def record(
         seconds: the duration; until Ctrl-C or SIGTERM unless given.
         rotate_mb: begin the next file, OUT-001.mcap, OUT-002.mcap and so on, at this size, megabytes.
         rotate_minutes: begin the next file after this time, minutes.
+        public: write also a picture of one camera each second, and the versions of this installation, so that others
+            can repeat and judge what it shows (docs/benchmark.md).
         force: replace an existing file.
     """
     rotation = Rotation(rotate_mb, rotate_minutes)
@@ -38,7 +41,7 @@ def record(
         opened as writer,
         connection.wait() as waiting,
     ):
-        recorder = ArenaRecorder(waiting, connection.arena, writer)
+        recorder = ArenaRecorder(waiting, connection.arena, writer, public)
         recorder.run(stop, seconds)
     for key, count in sorted(writer.counts.items()):
         say(f"{count:7} on {key}")

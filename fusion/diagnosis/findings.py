@@ -32,9 +32,9 @@ from fusion.protocol.arena_health import (
     describe_contradiction,
 )
 from fusion.protocol.pose_messages import FusionStatus
+from fusion.recordings.arena_recording import PACKAGES
 from fusion.server.arena_config import ArenaConfig
 
-PACKAGES = ("roundel", "eclipse-zenoh", "numpy", "opencv-python-headless", "gtsam", "scipy", "mcap", "viser")
 CERTIFICATES = ("root_ca_certificate", "listen_certificate", "connect_certificate")
 RENEW_DAYS = 30
 MIN_FREE_GB = 2.0
@@ -69,7 +69,7 @@ class Finding(msgspec.Struct, frozen=True):
 def check_versions() -> Finding:
     """The versions of Python and of the packages that a server needs."""
     found, missing = [f"Python {platform.python_version()}"], []
-    for package in PACKAGES:
+    for package in (*PACKAGES, "viser"):
         try:
             found.append(f"{package} {version(package)}")
         except PackageNotFoundError:

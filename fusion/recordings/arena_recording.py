@@ -9,22 +9,25 @@ that a replay needs.
 import contextlib
 import logging
 import math
+import platform
 import queue
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import msgspec
 import zenoh
 
 from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
-from camera_node.protocol.messages import Detections, Keys, MessageError, decode
+from camera_node.protocol.messages import VERSION, Detections, Keys, MessageError, decode, encode
 from camera_node.protocol.server_connection import ServerConnection
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
@@ -32,6 +35,7 @@ from fusion.protocol.pose_messages import FusedFrames, FusionStatus, RobotPose, 
 from fusion.recordings.rotation import RotatingWriter
 
 log = logging.getLogger("fusion.recording")
+PACKAGES = ("roundel", "eclipse-zenoh", "numpy", "opencv-python-headless", "gtsam", "scipy", "mcap")
 Entry = tuple[str, bytes, int]  # key, data, time of arrival in ns
 QUEUE_SIZE = 20_000
 MAX_MESSAGE_BYTES = 1 << 22  # a frame with 4096 roundels has 0.3 MB
@@ -40,10 +44,12 @@ MAX_KEYS, MAX_KEY = 1024, 200  # the channels of a recording; characters of a ke
 WAIT_S = 0.1
 # Between requests for the rig and the robots: the first one may precede the route to the server.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
+PICTURE_S = 1.0  # between two pictures of a public recording
 # For the answer of a busy server, also after the end of a recording: without the robots there is no replay.
 ANSWER_S = 10.0
 NO_ROBOTS = "no robot is declared: a replay of this recording needs --robots robots.yaml"
 DETECTIONS, POSE, FRAMES = "/detections", "/pose", "/fusion/frames"  # the ends of keys
+INSTALLATION, SNAPSHOT = "/recording", "/snapshot"
 KINDS = {DETECTIONS: Detections, POSE: RobotPose, FRAMES: FusedFrames}
 T = TypeVar("T")
 
@@ -83,6 +89,7 @@ class ArenaRecording:
     limits: Limits | None = None  # of the server
     rig: Rig | None = None  # the first one
     robots: dict[str, Robot] = field(default_factory=dict)
+    installation: "Installation | None" = None  # of a public recording
     faults: Counter[str] = field(default_factory=Counter)
     counts: Counter[str] = field(
         default_factory=Counter
@@ -103,6 +110,12 @@ class ArenaRecording:
     def frame_sets(self) -> RecordedMessages[FusedFrames]:
         """The frame sets as the server formed them."""
         return RecordedMessages(self.path, FRAMES, FusedFrames, self.counts[FRAMES], lambda _, fused: fused)
+
+    def pictures(self) -> Iterator[tuple[str, bytes, int]]:
+        """The pictures of a public recording: camera, JPEG, and time of arrival (ns)."""
+        for key, data, received_ns in read_messages(self.path, Counter()) if self.path else ():
+            if key.endswith(SNAPSHOT):
+                yield key.split("/")[-2], data, received_ns
 
     def frames_and_sets(self) -> Iterator[tuple[int, Detections | FusedFrames]]:
         """Messages of cameras and frame sets, each with its arrival (ns), in one pass over the file."""
@@ -125,6 +138,8 @@ class ArenaRecording:
                 self.rig = decode(data, RigMessage).rig
             elif key.endswith("/robots"):
                 self.robots = decode(data, Robots).robots
+            elif key.endswith(INSTALLATION):
+                self.installation = decode(data, Installation)
         except MessageError:
             self.faults[f"undecodable messages on {key}"] += 1
 
@@ -150,6 +165,8 @@ class ArenaRecorder:
         connection: to the server; it stays open. Recording begins as soon as the server answers.
         arena: its name.
         writer: of the files.
+        is_public: write also the versions of this installation, and a picture of one camera each second, so that others
+            can judge by the recording.
 
     Attributes:
         lost: messages that were not written, by reason.
@@ -157,7 +174,11 @@ class ArenaRecorder:
     """
 
     def __init__(
-        self, connection: ServerConnection, arena: str, writer: RecordingWriter | RotatingWriter
+        self,
+        connection: ServerConnection,
+        arena: str,
+        writer: RecordingWriter | RotatingWriter,
+        is_public: bool = False,
     ) -> None:
         self.lost: Counter[str] = Counter()
         self.robots: frozenset[str] | None = None
@@ -169,6 +190,7 @@ class ArenaRecorder:
         # A server without a rig answers the second one only.
         self._missing = [Keys(arena).rig, robots_key(arena)]
         self._request_at_s, self._pause_s = 0.0, FIRST_PAUSE_S
+        self._picture_at_s = 0.0 if is_public else math.inf
         self._received: queue.Queue[Entry] = queue.Queue(QUEUE_SIZE)
         self._lock = threading.Lock()
         self._queued_bytes = 0
@@ -183,9 +205,12 @@ class ArenaRecorder:
         """
         end_s = time.monotonic() + (math.inf if seconds is None else seconds)
         self._connection.when_open(self._subscribe)
+        if self._picture_at_s < math.inf:
+            self._writer.put(self._arena + INSTALLATION, encode(installation()), time.time_ns())
         try:
             while not stop.is_set() and time.monotonic() < end_s:
                 self._request_missing()
+                self._request_picture()
                 self._write_next(WAIT_S)
         finally:
             self._unsubscribe()
@@ -277,3 +302,35 @@ class ArenaRecorder:
 
         for key in self._missing:
             session.get(key, take, timeout=ANSWER_S)
+
+    def _request_picture(self) -> None:
+        """Query the first camera by name for its picture from time to time; the reply is recorded under its key."""
+        session, keys = self._session, Keys(self._arena)
+        cameras = sorted(filter(None, map(keys.camera_in, self._writer.counts)))
+        if session is None or not cameras or time.monotonic() < self._picture_at_s:
+            return
+        self._picture_at_s = time.monotonic() + PICTURE_S
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None and str(reply.ok.key_expr) == keys.snapshot(cameras[0]):
+                self._enqueue(reply.ok)
+
+        session.get(keys.snapshot(cameras[0]), take, timeout=ANSWER_S)
+
+
+class Installation(msgspec.Struct, frozen=True, kw_only=True):
+    """The first message of a public recording, on the key `<arena>/recording`: with what it was made."""
+
+    version: int = VERSION
+    python: str
+    platform: str
+    packages: dict[str, str]  # name and version
+
+
+def installation() -> Installation:
+    """That of this program."""
+    found = {}
+    for package in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return Installation(python=platform.python_version(), platform=platform.platform(), packages=found)

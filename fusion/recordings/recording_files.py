@@ -112,6 +112,7 @@ CONTEXT = (
     "/rig",
     "/robots",
     "/status",
+    "/recording",
 )  # ends of keys whose latest message before the part still holds in it
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from calib.rig.recording import RecordingWriter
 from camera_node.foundation.errors import ConfigError
 
-REPEATED = ("/rig", "/robots")  # ends of keys whose latest message begins each file
+REPEATED = ("/rig", "/robots", "/recording")  # ends of keys whose latest message begins each file
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,14 @@
 
 import csv
 import threading
+from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+import zenoh
 
 from calib.rig.recording import RecordingWriter
 from calib.rig.rig import Rig
@@ -18,6 +20,8 @@ from camera_node.protocol.messages import encode
 from camera_node.protocol.server_connection import Connection, ServerConnection
 from fusion.commands.record import record
 from fusion.commands.replay import replay
+from fusion.commands.trim import trim
+from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import Robots
 from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder, read_recording
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
@@ -131,6 +135,37 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     assert recording.rig.cameras == ARENA.cameras
     assert recording.robots == server.pipeline.robots
     assert f"on {KEYS.detections('cam0')}" in capsys.readouterr().out
+
+
+def test_a_public_recording_has_pictures_and_versions(tmp_path):
+    """Of the first camera, as it sends them; a part of the recording keeps them, and the benchmark reads it."""
+    path, part, jpeg = tmp_path / "public.mcap", tmp_path / "part.mcap", b"\xff\xd8 as the camera sends it"
+    with serving(config(tmp_path)) as (server, client):
+
+        def answer(query: zenoh.Query) -> None:
+            query.reply(query.key_expr, jpeg)
+
+        session = client.connection.session(DEADLINE_S)
+        camera = session.declare_queryable(KEYS.snapshot("cam0"), answer)
+        stop = threading.Event()
+        with RecordingWriter(path) as writer:
+            recorder = ArenaRecorder(client.connection, "test", writer, is_public=True)
+            thread = threading.Thread(target=recorder.run, args=[stop])
+            thread.start()
+            wait_for(
+                lambda: writer.counts[KEYS.snapshot("cam0")] >= 2,
+                lambda: send(server, live(ARENA.messages(3))),
+            )
+            stop.set()
+            thread.join(DEADLINE_S)
+        camera.undeclare()
+    assert trim(path, part, from_s=0.5) == 0
+    for recording in map(read_recording, (path, part)):
+        assert recording.installation is not None
+        assert recording.installation.packages["roundel"] == version("roundel")
+        pictures = list(recording.pictures())
+        assert {picture[:2] for picture in pictures} == {("cam0", jpeg)}
+        assert not recording.faults
 
 
 def test_a_short_recording_of_a_busy_server_holds_its_rig_and_robots(tmp_path):
