@@ -21,7 +21,6 @@ from camera_node.protocol.server_connection import Connection, ServerConnection
 from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.commands.trim import trim
-from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import Robots
 from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder, read_recording
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
