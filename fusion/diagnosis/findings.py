@@ -3,7 +3,6 @@
 
 import errno
 import os
-import platform
 import re
 import shutil
 import socket
@@ -12,7 +11,6 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
@@ -31,8 +29,8 @@ from fusion.protocol.arena_health import (
     describe_calibration,
     describe_contradiction,
 )
+from fusion.protocol.installation import PACKAGES, installation
 from fusion.protocol.pose_messages import FusionStatus
-from fusion.recordings.arena_recording import PACKAGES
 from fusion.server.arena_config import ArenaConfig
 
 CERTIFICATES = ("root_ca_certificate", "listen_certificate", "connect_certificate")
@@ -68,15 +66,12 @@ class Finding(msgspec.Struct, frozen=True):
 
 def check_versions() -> Finding:
     """The versions of Python and of the packages that a server needs."""
-    found, missing = [f"Python {platform.python_version()}"], []
-    for package in (*PACKAGES, "viser"):
-        try:
-            found.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            missing.append(package)
+    made = installation()
+    missing = [package for package in PACKAGES if package not in made.packages]
     if missing:
         return Finding("error", "versions", f"{', '.join(missing)} is missing", INSTALL)
-    return Finding("ok", "versions", ", ".join(found))
+    found = (f"{package} {number}" for package, number in made.packages.items())
+    return Finding("ok", "versions", ", ".join((f"Python {made.python}", *found)))
 
 
 def check_listening(config: ArenaConfig, is_reached: bool) -> Iterator[Finding]:

@@ -9,33 +9,30 @@ that a replay needs.
 import contextlib
 import logging
 import math
-import platform
 import queue
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import msgspec
 import zenoh
 
 from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
-from camera_node.protocol.messages import VERSION, Detections, Keys, MessageError, decode, encode
+from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 from camera_node.protocol.server_connection import ServerConnection
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
+from fusion.protocol.installation import Installation, installation
 from fusion.protocol.pose_messages import FusedFrames, FusionStatus, RobotPose, Robots, robots_key
 from fusion.recordings.rotation import RotatingWriter
 
 log = logging.getLogger("fusion.recording")
-PACKAGES = ("roundel", "eclipse-zenoh", "numpy", "opencv-python-headless", "gtsam", "scipy", "mcap")
 Entry = tuple[str, bytes, int]  # key, data, time of arrival in ns
 QUEUE_SIZE = 20_000
 MAX_MESSAGE_BYTES = 1 << 22  # a frame with 4096 roundels has 0.3 MB
@@ -89,7 +86,7 @@ class ArenaRecording:
     limits: Limits | None = None  # of the server
     rig: Rig | None = None  # the first one
     robots: dict[str, Robot] = field(default_factory=dict)
-    installation: "Installation | None" = None  # of a public recording
+    installation: Installation | None = None  # of a public recording
     faults: Counter[str] = field(default_factory=Counter)
     counts: Counter[str] = field(
         default_factory=Counter
@@ -316,21 +313,3 @@ class ArenaRecorder:
                 self._enqueue(reply.ok)
 
         session.get(keys.snapshot(cameras[0]), take, timeout=ANSWER_S)
-
-
-class Installation(msgspec.Struct, frozen=True, kw_only=True):
-    """The first message of a public recording, on the key `<arena>/recording`: with what it was made."""
-
-    version: int = VERSION
-    python: str
-    platform: str
-    packages: dict[str, str]  # name and version
-
-
-def installation() -> Installation:
-    """That of this program."""
-    found = {}
-    for package in PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return Installation(python=platform.python_version(), platform=platform.platform(), packages=found)
