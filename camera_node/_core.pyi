@@ -60,6 +60,10 @@ class FrameColumns(TypedDict):
     offset_px: NDArray[np.float64]  # (N, 2)
     pose_cov: NDArray[np.float64]  # (N, 7, 7)
     track: NDArray[np.int32]  # (N,)
+    id: NDArray[np.int32]  # (N,) certain code, -1 for none; what follows is NaN without one
+    id_probability: NDArray[np.float64]  # (N,)
+    rotation_rad: NDArray[np.float64]  # (N,)
+    rotation_sigma: NDArray[np.float64]  # (N,)
     n_postponed: int  # seeds left for the next frame
 
 class Detector:

@@ -189,7 +189,15 @@ def _describe(roundel: Roundel) -> dict[str, Any]:
         "ratio": roundel.ratio,
         "contrast": roundel.contrast,
         "id": roundel.id,
+        "id_probability": _known(roundel.id_probability),
+        "rotation_rad": _known(roundel.rotation_rad),
+        "rotation_sigma": _known(roundel.rotation_sigma),
     }
+
+
+def _known(value: float) -> float | None:
+    """JSON has no NaN."""
+    return None if np.isnan(value) else value
 
 
 def _add_poses(rows: list, roundels: Roundels, lens: Lens, diameter_m: float) -> None:
@@ -213,6 +221,9 @@ def _table(rows: list[dict[str, Any]]) -> Table:
     table = Table()
     for heading in ("u", "v", "sigma px", "major px", "minor px", "angle deg", "ratio", "contrast"):
         table.add_column(heading, justify="right")
+    has_codes = any(row["id"] is not None for row in rows)
+    if has_codes:
+        table.add_column("code", justify="right")
     if any(row.get("poses") for row in rows):
         table.add_column("position m", justify="right")
     for row in rows:
@@ -220,6 +231,8 @@ def _table(rows: list[dict[str, Any]]) -> Table:
         cells = [f"{row['u']:.2f}", f"{row['v']:.2f}", f"{sigma:.3f}"]
         cells += [f"{row['major_px']:.2f}", f"{row['minor_px']:.2f}", f"{np.degrees(row['angle_rad']):.1f}"]
         cells += [f"{row['ratio']:.3f}", f"{row['contrast']:.0f}"]
+        if has_codes:
+            cells.append("" if row["id"] is None else str(row["id"]))
         if row.get("poses"):
             cells.append(" ".join(f"{x:.3f}" for x in row["poses"][0]["position_m"]))
         table.add_row(*cells)

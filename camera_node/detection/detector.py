@@ -157,11 +157,7 @@ class Detector:
             ValueError: the array is not a grey image; `camera_node.sources.grey.to_grey` converts other formats.
         """
         columns = self._core.detect(_as_rows(image))
-        roundels = DetectedRoundels(
-            cov=columns["pose_cov"][:, :2, :2],
-            id=np.full(len(columns["track"]), -1, np.int32),
-            **columns,
-        )
+        roundels = DetectedRoundels(cov=columns["pose_cov"][:, :2, :2], **columns)
         if not self._mask:
             return roundels
         return roundels.select(np.array([not self._is_masked(uv) for uv in roundels.uv], bool))

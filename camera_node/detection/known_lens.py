@@ -74,6 +74,9 @@ class KnownLens:
             roundels.contrast,
             roundels.id,
             roundels.track,
+            roundels.id_probability,
+            roundels.rotation_rad,
+            roundels.rotation_sigma,
         )
         return constrained, chi2
 

@@ -2,7 +2,7 @@
 """The roundels of one frame: as columns for computation, as objects for display."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 from camera_node.foundation.arrays import Array
 
 DIAMETERS_M = 0.001, 10.0  # of the black disc of a roundel that can be located
+
+
+def _not_given() -> Array:
+    return np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,9 +27,11 @@ class Roundel:
         angle_rad: direction of the major axis from +u towards +v, in (-pi/2, pi/2].
         ratio: inner over outer diameter.
         contrast: bright minus dark, grey levels of 255.
-        id: the number printed in the roundel or given by a file, or None.
+        id: the number of its code where that is certain, or one that a file gives; or None.
         track: number of the roundel in all frames in which it is tracked, or None.
         offset_px, pose_cov: as in `DetectedRoundels`; None unless a detector measured them.
+        id_probability: of the code that was read; NaN where none was.
+        rotation_rad, rotation_sigma: as in `Roundels`.
     """
 
     uv: Array
@@ -38,14 +44,20 @@ class Roundel:
     track: int | None = None
     offset_px: Array | None = None
     pose_cov: Array | None = None
+    id_probability: float = np.nan
+    rotation_rad: float = np.nan
+    rotation_sigma: float = np.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Roundels:
     """All roundels of one frame, as columns of N rows. `id` and `track` are -1 where there is none.
 
-    Shapes: uv (N, 2), cov (N, 2, 2), axes_px (N, 2), angle_rad, ratio, contrast, id and track (N,).
-    Unknown values are NaN.
+    Shapes: uv (N, 2), cov (N, 2, 2), axes_px (N, 2), and (N,) of all others. Unknown values are NaN, which columns that
+    are not given contain.
+
+    The zero of a code is seen on the outer ellipse at `uv` + A (cos, sin) of `rotation_rad`, where A is the symmetric
+    matrix with half the axes; `rotation_sigma` is the standard deviation of that angle.
     """
 
     uv: Array
@@ -56,6 +68,14 @@ class Roundels:
     contrast: Array
     id: NDArray[np.int32]
     track: NDArray[np.int32]
+    id_probability: Array = field(default_factory=_not_given)
+    rotation_rad: Array = field(default_factory=_not_given)
+    rotation_sigma: Array = field(default_factory=_not_given)
+
+    def __post_init__(self) -> None:
+        for name in ("id_probability", "rotation_rad", "rotation_sigma"):
+            if len(getattr(self, name)) != len(self.uv):
+                object.__setattr__(self, name, np.full(len(self.uv), np.nan))
 
     @classmethod
     def from_points(
@@ -88,6 +108,9 @@ class Roundels:
             float(self.contrast[k]),
             None if number < 0 else number,
             None if track < 0 else track,
+            id_probability=float(self.id_probability[k]),
+            rotation_rad=float(self.rotation_rad[k]),
+            rotation_sigma=float(self.rotation_sigma[k]),
         )
 
     def __iter__(self) -> Iterator[Roundel]:
@@ -108,9 +131,9 @@ class DetectedRoundels(Roundels):
             shapes.
     """
 
-    offset_px: Array
-    pose_cov: Array
-    n_postponed: int = 0
+    offset_px: Array = field(kw_only=True)
+    pose_cov: Array = field(kw_only=True)
+    n_postponed: int = field(default=0, kw_only=True)
 
     def select(self, rows: NDArray) -> "DetectedRoundels":
         """The rows that a mask or an index array selects."""

@@ -48,6 +48,10 @@ static nb::dict detect(roundel::Detector& detector, const GreyImage& image) {
     named["offset_px"] = array(columns.offset_px, n, {2});
     named["pose_cov"] = array(columns.pose_cov, n, {roundel::kPoseCount, roundel::kPoseCount});
     named["track"] = array(columns.track, n);
+    named["id"] = array(columns.id, n);
+    named["id_probability"] = array(columns.id_probability, n);
+    named["rotation_rad"] = array(columns.rotation_rad, n);
+    named["rotation_sigma"] = array(columns.rotation_sigma, n);
     named["n_postponed"] = result.n_postponed;
     return named;
 }

@@ -73,7 +73,7 @@ FrameResult Detector::detect(const ImageView& image) {
     fit_moving_streaks(candidates.streaks, frame);
     const bool learned = decide(frame);
     // 5. Tracks, and what the next frame needs not search again.
-    tracks_.update(frame.found);
+    tracks_.update(frame.found, frame.image);
     if (paper_)
         update_theta(frame.found);
     else

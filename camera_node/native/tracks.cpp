@@ -70,7 +70,7 @@ void Tracks::forget_models() {
     for (Track& t : tracks_) t.steady = false;
 }
 
-void Tracks::update(std::vector<TrackedFit>& found) {
+void Tracks::update(std::vector<TrackedFit>& found, const ImageView& image) {
     std::vector<bool> taken(tracks_.size(), false);
     std::vector<Track> now;
     const auto continue_track = [&](TrackedFit& roundel, const Track& t) {
@@ -79,7 +79,8 @@ void Tracks::update(std::vector<TrackedFit>& found) {
         const double frames = t.missed + 1;
         now.push_back({t.number, roundel.fit, (roundel.fit.outer.x - t.fit.outer.x) / frames,
                        (roundel.fit.outer.y - t.fit.outer.y) / frames, 0,
-                       roundel.fit.unoccluded && distance(t, roundel.fit) < kSteady});
+                       roundel.fit.unoccluded && distance(t, roundel.fit) < kSteady, t.code});
+        roundel.code = now.back().code.add(image, roundel.fit);
     };
     for (TrackedFit& roundel : found)
         for (const Track& t : tracks_)
@@ -92,6 +93,7 @@ void Tracks::update(std::vector<TrackedFit>& found) {
             roundel.track = next_;
             next_ = (next_ + 1) % kNumbers;
             now.push_back({roundel.track, roundel.fit, 0, 0, 0, false});
+            roundel.code = now.back().code.add(image, roundel.fit);
         }
     }
     for (size_t k = 0; k < tracks_.size(); ++k)

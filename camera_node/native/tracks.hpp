@@ -2,15 +2,18 @@
 #pragma once
 #include <vector>
 
+#include "code/code_reader.hpp"
 #include "fit/photometric_fit.hpp"
+#include "numeric/image.hpp"
 #include "search/chords.hpp"
 
 namespace roundel {
 
-/// A roundel of a frame and the number of its track.
+/// A roundel of a frame, the number of its track, and what the frames of the track show of its code.
 struct TrackedFit {
     RoundelFit fit;
     int track;
+    CodeReading code{};
 };
 
 /// A roundel of the last frame, predicted by its last velocity.
@@ -32,9 +35,10 @@ class Tracks {
     std::vector<ExpectedRoundel> expect() const;
     /// The last ellipses of lost tracks that are not deleted yet.
     std::vector<Ellipse> lost() const;
-    /// Takes the roundels of a frame. A roundel without a number (below 0) continues the nearest track that
-    /// is predicted within a diameter, or starts a new one. A lost track is deleted after 30 frames.
-    void update(std::vector<TrackedFit>& found);
+    /// Takes the roundels of a frame, and reads their codes in its image. A roundel without a number (below
+    /// 0) continues the nearest track that is predicted within a diameter, or starts a new one. A lost track
+    /// is deleted after 30 frames.
+    void update(std::vector<TrackedFit>& found, const ImageView& image);
     /// Lets the next fits start from rays, since the models of the last frame hold no longer.
     void forget_models();
 
@@ -46,6 +50,7 @@ class Tracks {
         double vy;   // pixels per frame
         int missed;  // frames
         bool steady;
+        CodeTrack code{};
     };
     static double distance(const Track& track, const RoundelFit& fit);
     const Track* nearest(const RoundelFit& fit, const std::vector<bool>& taken) const;

@@ -91,14 +91,21 @@ class ColumnMessage(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         COLUMNS: type and number of values in each row; the first column gives the number of rows.
         MAX_ROWS: messages with more are refused.
+        OPTIONAL: columns that are empty where no value is known.
     """
 
     COLUMNS: ClassVar[dict[str, tuple[np.dtype, int]]]
     MAX_ROWS: ClassVar[int]
+    OPTIONAL: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod
     def _to_bytes(cls, columns: Mapping[str, np.ndarray]) -> dict[str, bytes]:
-        return {name: columns[name].astype(dtype).tobytes() for name, (dtype, _) in cls.COLUMNS.items()}
+        known = {
+            name: column
+            for name, column in columns.items()
+            if name not in cls.OPTIONAL or not np.isnan(column).all()
+        }
+        return {name: column.astype(cls.COLUMNS[name][0]).tobytes() for name, column in known.items()}
 
     def __len__(self) -> int:
         name, (dtype, width) = next(iter(self.COLUMNS.items()))
@@ -116,7 +123,7 @@ class ColumnMessage(msgspec.Struct, frozen=True, kw_only=True):
             raise MessageError(f"{n} roundels; a message has at most {self.MAX_ROWS}")
         for name, (dtype, width) in self.COLUMNS.items():
             size = len(getattr(self, name))
-            if size != n * width * dtype.itemsize:
+            if size != n * width * dtype.itemsize and not (name in self.OPTIONAL and size == 0):
                 raise MessageError(f"column {name} of {size} bytes for {n} roundels")
 
 
@@ -129,7 +136,8 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
 
     Columns with one row for each roundel: `uv` (N, 2) <f8 raw pixels; `cov` (N, 3) <f4 uu, uv, vv, square pixels;
     `axes_px` (N, 2) <f4 full major and minor axis; `angle_rad`, `ratio`, `contrast` (N,) <f4;
-    `id` and `track` (N,) <i4, -1 for none. Unknown values are NaN.
+    `id` and `track` (N,) <i4, -1 for none; `id_probability`, `rotation_rad` and `rotation_sigma` (N,) <f4 of a code
+    (`Roundels`), left out where no roundel of the frame has one. Unknown values are NaN.
     """
 
     COLUMNS: ClassVar = {
@@ -141,8 +149,12 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
         "contrast": (F4, 1),
         "id": (I4, 1),
         "track": (I4, 1),
+        "id_probability": (F4, 1),
+        "rotation_rad": (F4, 1),
+        "rotation_sigma": (F4, 1),
     }
     MAX_ROWS: ClassVar = MAX_ROUNDELS
+    OPTIONAL: ClassVar = frozenset({"id_probability", "rotation_rad", "rotation_sigma"})
 
     version: int = VERSION
     camera: str
@@ -165,6 +177,9 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
     contrast: bytes
     id: bytes
     track: bytes
+    id_probability: bytes = b""
+    rotation_rad: bytes = b""
+    rotation_sigma: bytes = b""
 
     @classmethod
     def pack(cls, roundels: Roundels, **header) -> "Detections":
@@ -194,6 +209,11 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
         self._check_header()
         if not _core.are_plausible(self.uv, self.cov, MAX_VARIANCE_PX2):
             raise MessageError("a centre or a covariance is NaN or out of range")
+        probability, sigma = self._column("id_probability"), self._column("rotation_sigma")
+        if (sigma <= 0).any() or (probability < 0).any() or (probability > 1).any():
+            raise MessageError("a code's probability or standard deviation is out of range")
+        if np.isinf(self._column("rotation_rad")).any():
+            raise MessageError("a code's rotation is infinite")
 
     def _check_header(self) -> None:
         if not (is_name(self.camera) and 0 < self.width <= 32768 and 0 < self.height <= 32768):

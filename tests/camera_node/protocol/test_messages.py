@@ -2,6 +2,7 @@
 """Messages are decoded as they were encoded, and invalid bytes raise MessageError."""
 
 import contextlib
+import dataclasses
 import math
 
 import msgspec
@@ -83,6 +84,28 @@ def test_truncated_and_altered_messages_are_refused(data: st.DataObject):
         pass
 
 
+def test_codes_are_sent_where_a_roundel_has_one():
+    """Without a code, a message has no column of codes; a reader of either gets NaN where nothing is known."""
+    plain = Roundels.from_points(np.ones((2, 2)), 0.3)
+    coded = dataclasses.replace(
+        plain,
+        id=np.array([7, -1], np.int32),
+        id_probability=np.array([1.0, np.nan]),
+        rotation_rad=np.array([0.5, np.nan]),
+        rotation_sigma=np.array([0.25, np.nan]),
+    )
+    for sent in (plain, coded):
+        message = Detections.pack(sent, **HEADER)
+        assert bool(message.rotation_rad) == (sent is coded)
+        got = decode(encode(message), Detections).unpack()
+        for name in ("id", "id_probability", "rotation_rad", "rotation_sigma"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(sent, name))
+    older = {
+        k: v for k, v in msgspec.msgpack.decode(encode(Detections.pack(plain, **HEADER))).items() if v != b""
+    }
+    assert np.isnan(decode(msgspec.msgpack.encode(older), Detections).unpack().rotation_rad).all()
+
+
 COLUMNS = ("uv", "cov", "axes_px", "angle_rad", "ratio", "contrast", "id", "track")
 GOOD = Detections.pack(Roundels.from_points(np.ones((2, 2)), 0.3), **HEADER)
 
@@ -100,6 +123,9 @@ def test_columns_of_other_lengths_are_refused(column: str):
         {"uv": np.array([1e300, 1, 1, 1]).tobytes()},
         {"cov": np.array([math.inf, 0, 0, 1, 0, 1], "<f4").tobytes()},
         {"cov": np.array([1, 1, 1, 1, 0, 1], "<f4").tobytes()},
+        {"rotation_sigma": np.array([0.1, 0], "<f4").tobytes()},
+        {"rotation_rad": np.array([math.inf, 0], "<f4").tobytes()},
+        {"id_probability": np.array([1.5, 0.5], "<f4").tobytes()},
         {"width": 0},
         {"height": 10**6},
         {"t_ns": -1},

@@ -1,0 +1,38 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include <vector>
+
+#include "code/code_book.hpp"
+#include "fit/photometric_fit.hpp"
+
+namespace roundel {
+
+/// The code of a roundel, if its name is certain.
+struct CodeReading {
+    int name = 0;            // number of the code; 0 where it is not certain
+    double probability = 0;  // of that name
+    /// Where the zero of the code is on the outer ellipse, at centre + S^(1/2) (cos, sin) for its shape S,
+    /// and the standard deviation; radians.
+    double rotation = 0, sigma = 0;
+};
+
+/// Mean log-likelihoods of the frames of a track: of no code, then of each code.
+struct CodeEvidence {
+    double count = 0;  // frames, at most 1 / rho
+    std::vector<float> means;
+};
+
+/// What the frames of a track show of its code (detector_model.md, section 10).
+///
+/// Errors of the model, such as uneven light, are alike in all frames. With the share `rho` of them in the
+/// variance, n frames count as n / (1 + (n - 1) rho).
+class CodeTrack {
+  public:
+    /// Adds a frame, and returns what is known after it.
+    CodeReading add(const ImageView& image, const RoundelFit& fit);
+
+  private:
+    CodeEvidence evidence_;
+};
+
+}  // namespace roundel

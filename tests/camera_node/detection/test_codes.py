@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Names and headings of coded roundels in rendered pictures: right, or unknown."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from camera_node.detection.detector import Detector
+from camera_node.detection.roundels import DetectedRoundels
+from camera_node.foundation.arrays import Grey, Index
+from camera_node.geometry import codes
+from tests.benchmarks.detector.pictures import Card, dead_leaves, expose, flat, grid, paste, sight_of
+
+SIZE = (300, 400)
+
+
+def cards(count: int, diameter: float, tilt: float, seed: int) -> list[Card]:
+    """Cards with different codes, turned and tilted in random directions."""
+    rng = np.random.default_rng(seed)
+    numbers = rng.permutation(len(codes.words()))[:count] + 1
+    return [
+        Card(
+            uv, diameter, tilt, *rng.uniform(0, 2 * np.pi, 1), card=codes.CARD, code=int(n), spin=float(spin)
+        )
+        for uv, n, spin in zip(grid(count, SIZE, rng), numbers, rng.uniform(0, 2 * np.pi, count), strict=True)
+    ]
+
+
+def picture(shown: list[Card], seed: int, clutter: bool = True) -> Grey:
+    rng = np.random.default_rng(seed)
+    return expose(paste(dead_leaves(SIZE, rng) if clutter else flat(SIZE, 90.0), shown), 3.0, rng)
+
+
+def rotation_of(card: Card) -> float:
+    """`rotation_rad` of the true outline: where the code's zero is seen on the outer edge."""
+    sight = sight_of(card, (SIZE[1], SIZE[0]))
+    n, c, r = sight.normal, sight.position, sight.diameter_m / 2
+    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
+    first /= np.linalg.norm(first)
+    zero = c + r * (np.cos(card.spin) * first + np.sin(card.spin) * np.cross(n, first))
+    dual = sight.lens.K @ (np.outer(c, c) - r * r * (np.eye(3) - np.outer(n, n))) @ sight.lens.K.T
+    dual /= dual[2, 2]
+    centre = dual[:2, 2]
+    values, axes = np.linalg.eigh(np.outer(centre, centre) - dual[:2, :2])
+    u, v = axes @ ((axes.T @ (sight.lens.project(zero[None])[0] - centre)) / np.sqrt(values))
+    return float(np.arctan2(v, u))
+
+
+def rows_of(found: DetectedRoundels, shown: list[Card]) -> Index:
+    """The detection of each card."""
+    apart = np.linalg.norm(found.uv[None] - np.array([card.uv for card in shown])[:, None], axis=2)
+    assert (apart.min(1) < 3).all()
+    return apart.argmin(1)
+
+
+@pytest.mark.parametrize(("diameter", "tilt"), [(12.0, 0.0), (16.0, 0.8), (30.0, 1.05)])
+def test_one_frame_names_and_turns_cards(diameter: float, tilt: float):
+    """All names are right. Squared errors of the headings over their variances have the mean 1, that of a median-like
+    estimate of the noise from six edges or more at most 3; nothing is off by a sector."""
+    shown = cards(30, diameter, tilt, 1)
+    found = Detector().detect(picture(shown, 2))
+    rows = rows_of(found, shown)
+    assert found.id[rows].tolist() == [card.code for card in shown]
+    assert (found.id_probability[rows] > 1 - 2e-6).all()
+    error = found.rotation_rad[rows] - [rotation_of(card) for card in shown]
+    error = (error + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(error).max() < codes.STEP / 4
+    assert np.mean((error / found.rotation_sigma[rows]) ** 2) < 3
+
+
+def test_mirrored_codes_have_no_name():
+    shown = cards(30, 24.0, 0.5, 3)
+    image = picture(shown, 4)
+    assert (Detector().detect(image).id > 0).sum() == 30
+    detector = Detector()
+    for _ in range(3):
+        found = detector.detect(np.ascontiguousarray(image[:, ::-1]))
+        assert len(found) >= 30
+        assert (found.id == -1).all()
+        assert np.isnan([found.id_probability, found.rotation_rad, found.rotation_sigma]).all()
+
+
+@pytest.mark.parametrize("clutter", [False, True])
+def test_plain_roundels_have_no_name(clutter: bool):
+    shown = [replace(card, code=0, card=9 / 7) for card in cards(30, 20.0, 0.4, 5)]
+    detector = Detector()
+    for seed in range(4):
+        found = detector.detect(picture(shown, seed, clutter))
+        assert len(found) >= 30
+        assert (found.id == -1).all()
+
+
+def test_frames_of_a_track_add_up():
+    """Faint codes whose single frames are uncertain get their names from several, and none a wrong one."""
+    shown = cards(20, 14.0, 1.1, 6)
+    detector, named = Detector(), []
+    for seed in range(8):
+        rng = np.random.default_rng((7, seed))
+        found = detector.detect(expose(paste(flat(SIZE, 90.0), shown, dark=70.0, bright=130.0), 5.0, rng))
+        apart = np.linalg.norm(found.uv[:, None] - np.array([card.uv for card in shown])[None], axis=2)
+        due = np.array([card.code for card in shown])[apart.argmin(1)]
+        assert (found.id[found.id > 0] == due[found.id > 0]).all()
+        named.append(int((found.id > 0).sum()))
+    assert named[0] < 0.9 * named[-1]
+
+
+def test_a_track_that_becomes_another_card_changes_its_name_or_has_none():
+    shown = cards(12, 24.0, 0.3, 8)
+    detector = Detector()
+    for seed in range(6):
+        detector.detect(picture(shown, seed))
+    other = [replace(card, code=card.code % len(codes.words()) + 1) for card in shown]
+    ids = np.empty(0)
+    for seed in range(6, 9):
+        found = detector.detect(picture(other, seed))
+        ids = found.id[rows_of(found, other)]
+        assert all(name in (-1, card.code) for name, card in zip(ids.tolist(), other, strict=True))
+    assert ids.tolist() == [card.code for card in other]
