@@ -38,19 +38,20 @@ from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptio
 from camera_node.sources.recorded_detections import read_observations
 
 PROGRAM = "roundel calibrate wand"
+VIEWS_DEG = (5, 150)  # of lenses that have a pinhole model
 
 
-def add_nominal_lenses(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> Rig:
-    """The rig with a nominal lens for each camera that it lacks; prints which ones.
+def add_nominal_lenses(
+    rig: Rig, sizes: Mapping[str, tuple[int, int]], degrees: float = FIELD_OF_VIEW_DEG
+) -> Rig:
+    """The rig with a nominal lens of this horizontal field of view for each camera that it lacks; prints which ones.
 
     Raises:
         CalibrationError: there is no camera at all.
     """
-    completed, missing = with_nominal_lenses(rig, sizes)
+    completed, missing = with_nominal_lenses(rig, sizes, degrees)
     if missing:
-        say(
-            f"no lens known of {', '.join(missing)}: starting from a field of view of {FIELD_OF_VIEW_DEG:g} degrees"
-        )
+        say(f"no lens known of {', '.join(missing)}: starting from a field of view of {degrees:g} degrees")
     if not completed.cameras:
         raise CalibrationError("no camera publishes; start cameras with roundel camera, or give --rig")
     return completed
@@ -61,8 +62,8 @@ class Wand(WandOptions):
     """Calibrate camera poses from a wand that is waved in front of the cameras."""
 
     rig: Path
-    """Intrinsics of the cameras; its poses are used with --only. With --live or --recording, the lens of a camera that
-    it lacks is found from a nominal one; the file may be missing."""
+    """Intrinsics of the cameras; its poses are used with --only. With --live, --recording, --field-of-view or
+    --image-size, the lens of a camera that it lacks is found from a nominal one; the file may be missing."""
     out: Path
     """The file for the rig with poses; a previous file is saved as rig.1.yaml, ..."""
     live: bool = False
@@ -78,6 +79,11 @@ class Wand(WandOptions):
     widen_lenses: float = 1.0
     """Multiply the standard deviations of the lenses by this, 1 or more: for lenses that changed since they were
     calibrated, or that are farther off than usual."""
+    field_of_view: float | None = None
+    """Horizontal field of view, degrees, from which lenses that --rig lacks are found; 60 unless given. It may be wrong
+    by a factor of two."""
+    image_size: tuple[int, int] | None = None
+    """Width and height of the images of cameras that --rig lacks, for --observations, which does not state them."""
     connection: ConnectionOptions = LOCAL_SERVER
 
     def run(self) -> None:
@@ -87,6 +93,10 @@ class Wand(WandOptions):
         require_positive(self.seconds)
         if not 1 <= self.widen_lenses < math.inf:
             raise ConfigError(f"--widen-lenses is {self.widen_lenses:g}; it must be 1 or more")
+        if not VIEWS_DEG[0] <= self._degrees <= VIEWS_DEG[1]:
+            raise ConfigError(
+                f"--field-of-view is {self._degrees:g}; it must be between {VIEWS_DEG[0]} and {VIEWS_DEG[1]} degrees"
+            )
         rig, wand = self._load_lenses(), load_wand(self.wand)
         if self.distance is not None and self.only is not None:
             raise ConfigError(
@@ -97,16 +107,49 @@ class Wand(WandOptions):
         if self.live:
             self._calibrate_live(rig, wand)
             return
-        messages = self.read_recording(rig, wand)
-        if self.recording is not None:
-            rig = add_nominal_lenses(rig, {m.camera: (m.width, m.height) for m in messages})
+        messages = self._with_image_size(rig, self.read_recording(rig, wand, self._may_lack_lenses))
+        if self._may_lack_lenses:
+            sizes = {m.camera: (m.width, m.height) for m in messages}
+            rig = add_nominal_lenses(rig, sizes, self._degrees)
         placed = self._calibrate(rig, wand, messages, self.measured_distance(rig))
         conclude(self.connection, placed, self.out, PROGRAM, live=False)
 
     def _load_lenses(self) -> Rig:
         """The rig; without cameras if there is no file, and cameras can be added."""
-        may_be_missing = self.only is None and (self.live or self.recording is not None)
-        return load_known_lenses(self.rig) if may_be_missing else load_rig(self.rig)
+        return load_known_lenses(self.rig) if self._may_lack_lenses else load_rig(self.rig)
+
+    @property
+    def _degrees(self) -> float:
+        return FIELD_OF_VIEW_DEG if self.field_of_view is None else self.field_of_view
+
+    @property
+    def _may_lack_lenses(self) -> bool:
+        guessed = self.live or any((self.recording, self.field_of_view, self.image_size))
+        return self.only is None and guessed
+
+    def _with_image_size(self, rig: Rig, messages: list[Detections]) -> list[Detections]:
+        """The messages with the given image size of cameras that the rig lacks.
+
+        Raises:
+            ConfigError: their source states none, and none is given.
+        """
+        if self.observations is None or not self._may_lack_lenses:
+            return messages
+        unknown = sorted({m.camera for m in messages} - rig.cameras.keys())
+        if not unknown:
+            return messages
+        if self.image_size is None:
+            raise ConfigError(
+                f"{self.observations} does not state the size of the images of {', '.join(unknown)}; add --image-size "
+                "WIDTH HEIGHT"
+            )
+        width, height = self.image_size
+        if min(width, height) < 1:
+            raise ConfigError(f"--image-size is {width} {height}; both must be 1 pixel or more")
+        return [
+            msgspec.structs.replace(m, width=width, height=height) if m.camera in unknown else m
+            for m in messages
+        ]
 
     def _calibrate(
         self, rig: Rig, wand: Body, messages: Sequence[Detections], distance: Distance | None
@@ -157,7 +200,9 @@ class Wand(WandOptions):
     def _calibrate_live(self, rig: Rig, wand: Body) -> None:
         with self.connection.open() as session:
             if self.only is None:
-                rig = add_nominal_lenses(rig, running_camera_sizes(session, self.connection.arena))
+                rig = add_nominal_lenses(
+                    rig, running_camera_sizes(session, self.connection.arena), self._degrees
+                )
             distance = self.measured_distance(rig)
             collected, reason = self._collect(session, rig, wand, distance)
         say(f"the wand session ended: {reason}")

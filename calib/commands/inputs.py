@@ -54,10 +54,11 @@ class WandOptions:
         flags = {f"--{name}": value for name, value in others.items()}
         require_one({**files, "--recording MCAP": self.recording, **flags})
 
-    def read_recording(self, rig: Rig, wand: Body) -> list[Detections]:
+    def read_recording(self, rig: Rig, wand: Body, any_camera: bool = False) -> list[Detections]:
         """The detections of the given recording; see `read_recording`."""
         require_several_cameras(self.frames)
-        return read_recording(rig, self.frames, self.observations, self.recording, wand, self.fps)
+        given = self.frames, self.observations, self.recording
+        return read_recording(rig, *given, wand, self.fps, any_camera)
 
     def measured_distance(self, rig: Rig) -> Distance | None:
         """The given distance.
@@ -88,6 +89,7 @@ def read_recording(
     recording: Path | None = None,
     body: Body | None = None,
     fps: float | None = None,
+    any_camera: bool = False,
 ) -> list[Detections]:
     """Read detections from one of: a folder of frames, a CSV of observations, an MCAP recording.
 
@@ -98,12 +100,14 @@ def read_recording(
         recording: MCAP of detections.
         body: the wand or frame, whose roundels are detected in `frames`.
         fps: frames a second, for observations with numbers of frames.
+        any_camera: whether folders of frames may be of cameras that the rig lacks.
 
     Raises:
         ConfigError, CameraError, CalibrationError: the input is unusable, or a camera is not in the rig.
     """
     if frames is not None:
-        _check_folders(frames, rig)
+        if not any_camera:
+            _check_folders(frames, rig)
         return detect_frames(frames, **({"inner_ratios": (body.inner_ratio,)} if body else {}))
     if recording is not None:
         return read_detections(recording)

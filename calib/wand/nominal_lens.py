@@ -18,14 +18,14 @@ from calib.wand.bundle_adjustment.covariance import parameter_sigma, unknown_sig
 FIELD_OF_VIEW_DEG = 60.0  # horizontal; most webcams and Pi cameras have 54 to 70
 
 
-def nominal_lens(width: int, height: int, focal_px: float | None = None) -> Camera:
+def nominal_lens(width: int, height: int, degrees: float = FIELD_OF_VIEW_DEG) -> Camera:
     """A camera of this image size, pixels, with the standard deviations of a guess.
 
     Args:
         width, height: of its images.
-        focal_px: the guess; by default that of the nominal field of view.
+        degrees: horizontal field of view.
     """
-    focal_px = focal_px or width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG / 2))
+    focal_px = width / 2 / math.tan(math.radians(degrees / 2))
     centre = (width - 1) / 2, (height - 1) / 2
     guess = Camera(
         width=width,
@@ -39,15 +39,18 @@ def nominal_lens(width: int, height: int, focal_px: float | None = None) -> Came
     return msgspec.structs.replace(guess, lens_sigma=parameter_sigma(guess, None, unknown_sigma(guess)))
 
 
-def with_nominal_lenses(rig: Rig, sizes: Mapping[str, tuple[int, int]]) -> tuple[Rig, list[str]]:
+def with_nominal_lenses(
+    rig: Rig, sizes: Mapping[str, tuple[int, int]], degrees: float = FIELD_OF_VIEW_DEG
+) -> tuple[Rig, list[str]]:
     """The rig with a nominal lens for each camera that it lacks, and the names of these.
 
     Args:
         rig: the known lenses.
         sizes: width and height of the images, pixels, by camera.
+        degrees: horizontal field of view of the nominal lenses.
     """
     missing = sorted(sizes.keys() - rig.cameras.keys())
-    lenses = {name: nominal_lens(*sizes[name]) for name in missing}
+    lenses = {name: nominal_lens(*sizes[name], degrees) for name in missing}
     return Rig(cameras={**rig.cameras, **lenses}, calibration=rig.calibration), missing
 
 

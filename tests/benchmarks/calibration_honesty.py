@@ -125,8 +125,13 @@ def without_lenses(rig: Rig, seed: int) -> Rig:
     rng, cameras = np.random.default_rng([11, seed]), {}
     for name, camera in rig.cameras.items():
         focal = float(np.exp(np.log(camera.fx * camera.fy) / 2 + np.log(2) * rng.uniform(-1, 1)))
-        cameras[name] = nominal_lens(camera.width, camera.height, focal)
+        cameras[name] = nominal_lens(camera.width, camera.height, field_of_view(camera.width, focal))
     return Rig(cameras=cameras)
+
+
+def field_of_view(width: int, focal_px: float) -> float:
+    """The horizontal field of view, degrees."""
+    return float(np.degrees(2 * np.arctan(width / 2 / focal_px)))
 
 
 def focal_error(result: WandCalibration, truth: Rig) -> float:

@@ -6,7 +6,7 @@ that of its error on held-out detections, or one worse where a camera or the wan
 detections show to be precise is not graded as useless.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from calib.rig.coverage import Coverage, cell_centres, enumerate_words
 from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_precision
 from calib.rig.triangulation import JointCovariance, camera_jacobians
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
+from calib.wand.quality.lenses import describe_open_lenses, find_lens_changes, find_open_lenses
 from calib.wand.wand_report import NOT_RECORDED, Validation, WandCalibration
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
@@ -116,6 +117,7 @@ class RigQuality:
         length_error: relative mean error of the wand's length; None with one marker.
         expected: predicted errors of points at the height of robots' roundels; None for a rig without scale.
         held_out: residuals of held-out detections; None where they could not be measured.
+        open_lenses: 95 % interval of each focal length that the recording does not determine, pixels, by camera.
     """
 
     cameras: list[CameraQuality]
@@ -123,6 +125,7 @@ class RigQuality:
     length_error: float | None
     expected: PrecisionMap | None
     held_out: Validation | None = None
+    open_lenses: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def grade(self) -> str:
@@ -138,7 +141,11 @@ class RigQuality:
         return max(shown, min(worst, GRADES[min(GRADES.index(shown) + 1, len(GRADES) - 1)]))
 
     def sentence(self) -> str:
-        """State the grade, its cause and the remedy."""
+        """State the grade, its cause and the remedy, and what is not determined."""
+        open_lenses = describe_open_lenses(self.open_lenses)
+        return f"{self._reason()}; {open_lenses}" if open_lenses else self._reason()
+
+    def _reason(self) -> str:
         worst = max(self.cameras, key=lambda camera: _severity(camera.worst, camera.figures[camera.worst]))
         if self.unplaced:
             reasons = "; ".join(
@@ -184,7 +191,9 @@ class RigQuality:
             }
             for camera in self.cameras
         }
-        return {"grade": self.grade, "because": self.sentence(), **self._expected(), "quality": cameras}
+        entries = {"grade": self.grade, "because": self.sentence(), **self._expected(), "quality": cameras}
+        ranges = {name: [round(low, 1), round(high, 1)] for name, (low, high) in self.open_lenses.items()}
+        return {**entries, **({"focal_px_between": ranges} if ranges else {})}
 
     def _expected(self) -> dict[str, Any]:
         if self.expected is None or not np.isfinite(self.expected.typical_mm):
@@ -237,7 +246,8 @@ def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQua
     error = None if length_mm is None or extent == 0 else abs(length_mm) / 1e3 / float(extent)
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
     expected = _predict(result, positions, covariance, height_m) if result.report.metric else None
-    return RigQuality(cameras, unplaced, error, expected, result.report.held_out)
+    open_lenses = find_open_lenses(find_lens_changes(result.names, result.adjusted))
+    return RigQuality(cameras, unplaced, error, expected, result.report.held_out, open_lenses)
 
 
 def wand_positions(result: WandCalibration) -> Array:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compares the lenses of an adjustment with those of the rig file."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from calib.rig.camera import LENS, lens_parameters
-from calib.wand.bundle_adjustment.covariance import camera_covariance
+from calib.wand.bundle_adjustment.covariance import FOCAL, camera_covariance
 from calib.wand.bundle_adjustment.problem import Adjusted
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
@@ -32,6 +32,14 @@ class LensChange:
     after: Lens
     sigma: Array
     sigmas: float
+
+    @property
+    def focal_range_px(self) -> tuple[float, float] | None:
+        """The 95 % interval of a focal length that is not known better than by a data sheet; None of others."""
+        if self.sigma[0] <= FOCAL:
+            return None
+        low, high = self.after.fx * np.exp(np.array([-1.96, 1.96]) * self.sigma[0])
+        return float(low), float(high)
 
     def sentence(self) -> str:
         """The change in words."""
@@ -73,6 +81,24 @@ def find_lens_changes(names: Sequence[str], adjusted: Adjusted) -> dict[str, Len
         sigmas = float(np.sqrt(change @ np.linalg.solve(cov, change) / len(change)))
         changes[name] = LensChange(lens, adjusted.state.lens(k, lens), np.sqrt(np.diag(cov)), sigmas)
     return changes
+
+
+def find_open_lenses(changes: Mapping[str, LensChange]) -> dict[str, tuple[float, float]]:
+    """The range, pixels, of each focal length that the recording does not determine, by camera."""
+    return {name: found for name, change in changes.items() if (found := change.focal_range_px) is not None}
+
+
+def describe_open_lenses(ranges: Mapping[str, tuple[float, float]]) -> str:
+    """What is not determined, and the remedy; empty where every focal length is."""
+    if not ranges:
+        return ""
+    which = ", ".join(
+        f"of '{name}' between {low:.0f} and {high:.0f} px" for name, (low, high) in ranges.items()
+    )
+    return (
+        f"focal lengths are not determined: {which}; move the wand towards the cameras and away from them, and where "
+        "more cameras see it, use a wand of two markers or more, or run roundel calibrate intrinsics"
+    )
 
 
 def describe_lens_changes(changes: dict[str, LensChange]) -> list[str]:

@@ -60,6 +60,26 @@ def test_wand_then_world_from_a_csv(tmp_path: Path, arena: Arena):
         assert camera.matrix()[:3, 3] == pytest.approx(truth[:3, 3], abs=5e-3)
 
 
+def test_observations_of_unknown_lenses_need_the_image_size_only(tmp_path: Path, arena: Arena):
+    """Without a rig file: a guess of 90 degrees for lenses of 75; focal lengths come within 1 %."""
+    options = [
+        *wand_options(tmp_path),
+        "--observations",
+        tmp_path / "observations.csv",
+        "--field-of-view",
+        90,
+    ]
+    options[options.index(tmp_path / "lenses.yaml")] = tmp_path / "none.yaml"
+    asked = calib("wand", *options)
+    assert asked.returncode == 2
+    assert "--image-size WIDTH HEIGHT" in asked.stderr
+    done = calib("wand", *options, "--image-size", 800, 600)
+    assert done.returncode == 0, done.stderr
+    assert "starting from a field of view of 90 degrees" in done.stdout
+    for name, camera in load_rig(tmp_path / "rig.yaml").cameras.items():
+        assert camera.fx == pytest.approx(arena.truth.cameras[name].fx, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("file", "text", "fault"),
     [

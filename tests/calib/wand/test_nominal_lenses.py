@@ -12,7 +12,9 @@ from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.focal_lengths import STEPS, with_rough_focal_lengths
 from calib.wand.nominal_lens import nominal_lens, with_nominal_lenses
-from tests.benchmarks.calibration_honesty import focal_error, without_lenses
+from calib.wand.quality.grade import assess
+from camera_node.geometry.body import Body
+from tests.benchmarks.calibration_honesty import field_of_view, focal_error, without_lenses
 from tests.calib.recordings import WandScenario
 from tests.calib.recordings import record as record_scenario
 from tests.calib.synthetic import Arena, errors, joint_error, record, ring
@@ -54,10 +56,12 @@ def test_the_wand_finds_lenses_from_fifty_to_seventy_degrees(degrees: float):
     messages = record(arena, 20.0, sigma_px=0.1)
     rig, missing = with_nominal_lenses(Rig(cameras={}), {m.camera: (m.width, m.height) for m in messages})
     assert missing == sorted(arena.truth.cameras)
-    found = calibrate(rig, arena.wand, messages).rig
+    result = calibrate(rig, arena.wand, messages)
+    found = result.rig
     ratios = [found.cameras[name].fx / camera.fx for name, camera in arena.truth.cameras.items()]
     assert np.allclose(ratios, 1.0, atol=5e-3)
     assert errors(found, arena.truth)[0] < 5e-3
+    assert assess(result, arena.wand).open_lenses == {}
 
 
 def test_rough_focal_lengths_are_found_between_half_and_twice_the_guess():
@@ -71,12 +75,33 @@ def test_rough_focal_lengths_are_found_between_half_and_twice_the_guess():
     given, factors = dict(arena.intrinsics.cameras), {"cam0": 0.5, "cam1": 0.8, "cam2": 2.0}
     for name, factor in factors.items():
         lens = truth[name]
-        given[name] = nominal_lens(lens.width, lens.height, factor * lens.fx)
+        given[name] = nominal_lens(lens.width, lens.height, field_of_view(lens.width, factor * lens.fx))
     found = with_rough_focal_lengths(Rig(cameras=given), arena.wand, messages).cameras
     assert found["cam3"] == given["cam3"]
     ratios = [found[name].fx / truth[name].fx for name in factors]
     step = 4 * math.log(2) / math.sqrt(3) / (STEPS - 1)
     assert np.abs(np.log(ratios)).max() < step
+
+
+def test_a_focal_length_that_is_not_determined_is_called_so():
+    """Two cameras and a light: the 95 % intervals are wide, contain the truth, and are in the sentence, which the page
+    and the command show, and in the file."""
+    light = Body(diameter_m=0.05)
+    scenario = WandScenario(
+        cameras=2, wand=light, seconds=8, rate_hz=20, sigma_px=0.2, numbered=True, sized=False, both_sides=True,
+        offset_ms=0, drift_ppm=0, free_running=False, seed=2,
+    )  # fmt: skip
+    recorded = record_scenario(scenario)
+    result = calibrate(without_lenses(recorded.intrinsics, 2), light, recorded.messages)
+    quality = assess(result, light)
+    assert set(quality.open_lenses) == set(recorded.truth.cameras)
+    for name, (low, high) in quality.open_lenses.items():
+        assert low < recorded.truth.cameras[name].fx < high
+        assert high / low > 1.1
+        assert f"of '{name}' between {low:.0f} and {high:.0f} px" in quality.as_dict()["because"]
+        sigma = result.rig.cameras[name].lens_sigma
+        assert sigma is not None
+        assert sigma[0] == pytest.approx(result.rig.cameras[name].fx * np.log(high / low) / 3.92, rel=0.01)
 
 
 @pytest.mark.slow
