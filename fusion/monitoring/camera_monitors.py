@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Decides which frames of which cameras are used: clocks, frozen images, frames that contradict, moved cameras."""
 
+from dataclasses import replace
+
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Array, Mask
 from fusion.model.corrections import ExtrinsicsCorrection
@@ -57,7 +59,7 @@ class CameraMonitors:
         excluded = self.rig.excluded
         if not excluded:
             return frame_set
-        return FrameSet(frame_set.t_ns, tuple(f for f in frame_set.frames if f.camera not in excluded))
+        return replace(frame_set, frames=tuple(f for f in frame_set.frames if f.camera not in excluded))
 
     def is_doubtful(self, t_ns: int) -> bool:
         """Whether a camera contradicted the others just now, or may be at fault."""

@@ -53,6 +53,12 @@ class Acquired:
     reasons: dict[int, str]
     crowded: Index
 
+    @classmethod
+    def none(cls, table: TrackTable, assignments: Assignments) -> "Acquired":
+        """Nothing, without a search."""
+        rows = np.empty(0, np.intp)
+        return cls(rows, table.states.select(rows), rows, assignments, [], {}, rows)
+
 
 class Acquisition:
     """Acquires robots of a track table.
@@ -89,7 +95,7 @@ class Acquisition:
             histories: of unlabeled markers before this frame set.
         """
         if not len(missing) and not self._leads:
-            return Acquired(missing, table.states.select(missing), missing, assignments, [], {}, missing[:0])
+            return Acquired.none(table, assignments)
         bodies, singles = missing[~table.single[missing]], missing[table.single[missing]]
         # A marker of a constellation may be assigned to a single-marker robot: its assignments are searched too.
         is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))

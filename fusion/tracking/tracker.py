@@ -53,6 +53,7 @@ class Update:
         associated: the assignments before those were dropped that do not fit.
         summary: of the assignments.
         poses: by row of the robot; acquisition does not change these.
+        is_searched: see `FrameSet`.
     """
 
     t_ns: int
@@ -63,6 +64,7 @@ class Update:
     associated: Assignments
     summary: ObservationSummary
     poses: dict[int, RobotPose]
+    is_searched: bool
 
 
 class Tracker:
@@ -173,8 +175,17 @@ class Tracker:
             self.geometry.note(summary.mean_px2)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
+        searched = frame_set.is_searched
         return Update(
-            t_ns, associated.prediction, tracked, detections, assignments, all_assigned, summary, poses
+            t_ns,
+            associated.prediction,
+            tracked,
+            detections,
+            assignments,
+            all_assigned,
+            summary,
+            poses,
+            searched,
         )
 
     def finish(self, update: Update) -> TrackingResult:
@@ -267,6 +278,8 @@ class Tracker:
 
     def _acquire(self, update: Update) -> tuple[Update, Acquired]:
         """Acquire missing robots; returns the update with their assignments."""
+        if not update.is_searched:
+            return update, Acquired.none(self.table, update.assignments)
         missing = np.flatnonzero(~update.tracked)
         if self.acquires_none or not self.table.owned[missing].any():  # other shards acquire their own
             missing = missing[:0]
@@ -295,7 +308,7 @@ class Tracker:
     def _track_unlabeled(self, update: Update, markers: list[Marker]) -> UnlabeledMarkers:
         """Track the remaining markers; the leading shard adds those that only one camera sees."""
         seen = self.unlabeled.track(update.t_ns, update.detections, markers)
-        if not self.shard.leads:
+        if not (self.shard.leads and update.is_searched):
             return seen
         used = np.concatenate([update.assignments.detection, seen.detections])
         rows = self.single_view.confirm(update.t_ns, update.detections, used)

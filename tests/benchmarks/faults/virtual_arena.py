@@ -43,10 +43,15 @@ class VirtualClock(Clock):
 
 
 class Outbox:
-    """Takes what the server publishes: poses go to the judge."""
+    """Takes what the server publishes: poses go to the judge.
+
+    Attributes:
+        received_ns: when the last message arrived.
+    """
 
     def __init__(self, judge: PoseJudge) -> None:
         self._judge = judge
+        self.received_ns = START_NS
 
     def publish(self, key: str, message: msgspec.Struct) -> None:
         """Judge a pose."""
@@ -113,15 +118,15 @@ class VirtualArena:
         """Let time pass."""
         end_ns = self.clock.t_ns + round(seconds * 1e9)
         while (at_ns := min(self._tick_ns, self._due[0][0], self._next_arrival_ns())) < end_ns:
-            self.clock.t_ns = at_ns
-            if at_ns == self._due[0][0]:
+            self.clock.t_ns = max(self.clock.t_ns, at_ns)  # unless the server still works
+            if self._due[0][0] <= self.clock.t_ns:
                 self._deliver()
             elif at_ns == self._tick_ns:
                 self._tick_ns += TICK_NS
                 self._serve()
             else:
                 self._receive()
-        self.clock.t_ns = end_ns
+        self.clock.t_ns = max(self.clock.t_ns, end_ns)
 
     def place(self, camera: str, fault: CameraFault) -> None:
         """Give a camera other faults."""
@@ -158,7 +163,8 @@ class VirtualArena:
         Path(robots).write_bytes(msgspec.yaml.encode({"robots": bodies}))
         server = Server(ArenaConfig(arena=ARENA, rig=rig, saved_rig=saved, robots=robots))
         server.clock = self.clock  # pyright: ignore[reportAttributeAccessIssue]
-        server.transport = Outbox(self.judge)  # pyright: ignore[reportAttributeAccessIssue]
+        self._outbox = Outbox(self.judge)
+        server.transport = self._outbox  # pyright: ignore[reportAttributeAccessIssue]
         return server
 
     def _schedule(self, name: str, seq: int) -> None:
@@ -166,7 +172,7 @@ class VirtualArena:
 
     def _deliver(self) -> None:
         """The next camera sends the frames that became available."""
-        _, name, seq = heapq.heappop(self._due)
+        due_ns, name, seq = heapq.heappop(self._due)
         source, lens = self._sources[name], self.load.rig[name]
         for frame, roundels in source.deliver(seq):
             message = Detections.pack(
@@ -180,21 +186,24 @@ class VirtualArena:
             )
             self._sent[name] += 1
             transit_ns = round(self._rng.exponential(TRANSIT_S) * 1e9)
-            arrival_ns = max(self._arrived_ns[name] + 1, self.clock.t_ns + transit_ns)
+            arrival_ns = max(self._arrived_ns[name] + 1, due_ns + transit_ns)
             self._arrived_ns[name] = arrival_ns
             heapq.heappush(self._arrivals, (arrival_ns, name, message.seq, encode(message)))
-        self._schedule(name, source.next_after(seq, self.clock.t_ns, source.fault.delay_ms))
+        self._schedule(name, source.next_after(seq, due_ns, source.fault.delay_ms))
 
     def _next_arrival_ns(self) -> int:
         return self._arrivals[0][0] if self._arrivals else self._tick_ns
 
     def _receive(self) -> None:
         arrival_ns, name, _, data = heapq.heappop(self._arrivals)
-        self.server._receive_detections(data, self._keys.detections(name), arrival_ns)
+        self._outbox.received_ns = arrival_ns
+        if self.clock.t_ns - arrival_ns <= self.server._max_lag_ns:
+            self.server._receive_detections(data, self._keys.detections(name), arrival_ns)
         self._serve()
 
     def _serve(self) -> None:
-        self.server._fuse(self.clock.t_ns, False)
+        is_backlogged = bool(self._arrivals) and self._arrivals[0][0] < self.clock.t_ns
+        self.server._fuse(self.clock.t_ns, is_backlogged)
         self.status = self.server._report_status(self.clock.t_ns) or self.status
 
 
