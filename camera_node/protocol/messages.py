@@ -188,6 +188,7 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
         columns["cov"] = roundels.cov.reshape(-1, 4)[:, [0, 1, 3]]
         return cls(**cls._to_bytes(columns), **header)
 
+    @np.errstate(invalid="ignore")  # as in `_check_codes`
     def unpack(self) -> Roundels:
         """Convert the columns to arrays."""
         columns = self.uv, self.cov, self.axes_px, self.angle_rad, self.ratio, self.contrast
@@ -201,6 +202,7 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
             numbers[10 * n :],
             np.frombuffer(self.id, I4),
             np.frombuffer(self.track, I4),
+            **{name: self._column(name) for name in self.OPTIONAL if getattr(self, name)},
         )
 
     def check(self) -> None:
@@ -209,6 +211,11 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
         self._check_header()
         if not _core.are_plausible(self.uv, self.cov, MAX_VARIANCE_PX2):
             raise MessageError("a centre or a covariance is NaN or out of range")
+        if any(getattr(self, name) for name in self.OPTIONAL):
+            self._check_codes()
+
+    @np.errstate(invalid="ignore")  # the conversion turns signalling NaNs into quiet ones
+    def _check_codes(self) -> None:
         probability, sigma = self._column("id_probability"), self._column("rotation_sigma")
         if (sigma <= 0).any() or (probability < 0).any() or (probability > 1).any():
             raise MessageError("a code's probability or standard deviation is out of range")
