@@ -15,6 +15,7 @@ from typing import Any, Literal
 from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.foundation.extras import require
 from camera_node.geometry.pose import wxyz_from_rotation
+from fusion.bridges.mavlink_check import AutopilotCheck
 from fusion.bridges.mavlink_frames import FrdFrames, FrdPose, roll_pitch_yaw, upper_triangle
 from fusion.bridges.pose_queue import WAIT_S, PoseQueue
 from fusion.client.server_time import ServerTimeReader
@@ -133,22 +134,25 @@ class MavlinkVehicle:
         )
         return True
 
-    def answer(self, now_ns: int | None) -> None:
-        """Answer the requests for the time that have arrived.
+    def answer(self, now_ns: int | None) -> list[Any]:
+        """Answer the requests for the time that have arrived; return all messages.
 
         Args:
             now_ns: the server's present time; None if it is not known: then nothing is answered.
         """
+        messages = []
         for _ in range(MAX_DATAGRAMS):
             try:
                 data = self._socket.recv(2048)
             except BlockingIOError:
-                return
+                break
             except OSError:  # nothing listens there yet
                 continue
-            for message in self._parse(data):
-                if now_ns is not None and message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                    self._send(self._mavlink.MAVLink_timesync_message(now_ns, message.ts1))
+            messages += self._parse(data)
+        for message in messages:
+            if now_ns is not None and message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                self._send(self._mavlink.MAVLink_timesync_message(now_ns, message.ts1))
+        return messages
 
     def send_odometry(self, t_ns: int, pose: FrdPose, resets: int, quality: int = UNKNOWN) -> None:
         """Send ODOMETRY in MAV_FRAME_LOCAL_FRD, with the velocity in MAV_FRAME_BODY_FRD."""
@@ -199,6 +203,9 @@ class MavlinkBridge:
         frames: MAVLink's frames in the arena.
         rate: of the poses that are sent.
         kind: the message.
+
+    Attributes:
+        check: is given what is sent and what the autopilot estimates, unless it is None.
     """
 
     def __init__(
@@ -209,6 +216,7 @@ class MavlinkBridge:
         kind: Literal["odometry", "vision"] = "odometry",
     ) -> None:
         self.resets = ResetCounter()
+        self.check: AutopilotCheck | None = None
         self._vehicle, self._frames, self._rate = vehicle, frames, rate
         self._kind = kind
         self._last: RobotPose | None = None  # that was sent
@@ -217,7 +225,10 @@ class MavlinkBridge:
     def step(self, poses: PoseQueue, clock: ServerTimeReader) -> None:
         """Wait for poses and requests, at most `WAIT_S`, and pass them on."""
         select.select([poses, self._vehicle], [], [], WAIT_S)
-        self._vehicle.answer(clock.now_ns())
+        now_ns = clock.now_ns()
+        for message in self._vehicle.answer(now_ns):
+            if self.check is not None and now_ns is not None:
+                self.check.add_message(now_ns, message)
         for pose in poses.take():
             if pose.state == "lost":
                 self._lose(pose.t_ns)
@@ -235,7 +246,10 @@ class MavlinkBridge:
             return
         self._last, self._is_lost = pose, False
         send = self._vehicle.send_odometry if self._kind == "odometry" else self._vehicle.send_vision
-        send(pose.t_ns, self._frames.convert(pose), self.resets.count)
+        converted = self._frames.convert(pose)
+        send(pose.t_ns, converted, self.resets.count)
+        if self.check is not None:
+            self.check.add_sent(pose.t_ns, converted)
 
     def _lose(self, t_ns: int) -> None:
         self.resets.add_loss()
