@@ -25,7 +25,7 @@ MAX_SAMPLES = 20_000
 
 
 @dataclass(frozen=True)
-class Alignment:
+class AutopilotAlignment:
     """How the autopilot's positions follow from those that it was sent; see the module.
 
     Attributes:
@@ -47,9 +47,9 @@ class Alignment:
         return self.spread_m >= MIN_SPREAD_M and self.rms_m <= MAX_OFF * self.spread_m
 
 
-def align(sent: Array, estimated: Array) -> Alignment | None:
+def align(sent: Array, estimated: Array) -> AutopilotAlignment | None:
     """Fit the model to rows (N, 4) and (M, 4) of time (s) and position (m); None where they do not overlap."""
-    best: Alignment | None = None
+    best: AutopilotAlignment | None = None
     for delay_s in DELAYS_S.tolist():
         at = estimated[:, 0] - delay_s
         rows = (at >= sent[0, 0]) & (at <= sent[-1, 0])
@@ -60,7 +60,7 @@ def align(sent: Array, estimated: Array) -> Alignment | None:
             found = _fit(p @ DOWN if is_mirrored else p, estimated[rows, 1:])
             if best is None or found[2] < best.rms_m:
                 spread = float(np.sqrt(p.var(0).sum()))
-                best = Alignment(delay_s, found[0], found[1], is_mirrored, found[2], spread)
+                best = AutopilotAlignment(delay_s, found[0], found[1], is_mirrored, found[2], spread)
     return best
 
 
@@ -142,7 +142,7 @@ def _timed(rows: Sequence[tuple[float, ...]]) -> Array:
     return np.column_stack([boot_s + (table[:, 0] - boot_s).min(), table[:, 2:]])
 
 
-def _undetermined(found: Alignment) -> str:
+def _undetermined(found: AutopilotAlignment) -> str:
     if found.spread_m < MIN_SPREAD_M:
         return "the vehicle hardly moved: carry it about by half a metre in all directions, and turn it"
     off = f"{found.rms_m:.2f} m RMS of {found.spread_m:.2f} m of motion"
@@ -150,7 +150,7 @@ def _undetermined(found: Alignment) -> str:
     return f"the autopilot's positions do not follow those that it is sent ({off}): {remedy}"
 
 
-def _describe(found: Alignment) -> Iterator[tuple[bool, str]]:
+def _describe(found: AutopilotAlignment) -> Iterator[tuple[bool, str]]:
     if found.is_mirrored:
         yield False, "z points up in the autopilot's positions and down in those that it is sent"
     degrees = np.degrees(found.angle)
