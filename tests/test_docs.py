@@ -18,7 +18,7 @@ from calib.rig.rig import load_rig
 from calib.wand.quality.grade import LIMITS
 from camera_node.commands.camera_command import JoinArena
 from tests.calib.stick import LENGTH_M, write_stick
-from tests.conftest import ROOT
+from tests.conftest import ROOT, free_port
 from tests.pages import commands, page
 from tests.source_tree import name_of, python_files
 from tests.waiting import wait_for
@@ -98,15 +98,18 @@ def test_a_network_camera():
 
 
 @pytest.fixture
-def shards(tmp_path: Path, endpoint: str) -> Iterator[tuple[Path, str]]:
-    """The two servers of the page on a reserved port."""
-    arena = (ROOT / "configs" / "arena.yaml").read_text().replace("tcp/127.0.0.1:7447", endpoint)
-    (tmp_path / "arena.yaml").write_text(arena)
+def zones(tmp_path: Path, endpoint: str) -> Iterator[tuple[Path, str]]:
+    """The two servers of the page, on reserved ports."""
+    text = (ROOT / "docs" / "lab.md").read_text()
+    (arena,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    east = f"tcp/127.0.0.1:{free_port()}"
+    arena = arena.replace("tcp/west.local:7447", endpoint).replace("tcp/east.local:7447", east)
+    (tmp_path / "arena.yaml").write_text(arena.replace("arena: hall", "arena: arena"))
     shutil.copy(ROOT / "configs" / "robots.yaml", tmp_path)
     servers = [
         Program(roundel_command(*shlex.split(line)[1:]), tmp_path)
         for line in page("lab.md")
-        if "--shard" in line
+        if "--zone" in line
     ]
     try:
         for server in servers:
@@ -116,9 +119,9 @@ def shards(tmp_path: Path, endpoint: str) -> Iterator[tuple[Path, str]]:
         assert [server.stop() for server in servers] == [0, 0]
 
 
-def test_a_lab(shards: tuple[Path, str]):
+def test_a_lab(zones: tuple[Path, str]):
     """Health and doctor report that the cameras are missing; the bridge of another machine connects to both routers."""
-    folder, endpoint = shards
+    folder, endpoint = zones
     for line in page("lab.md"):
         words = shlex.split(line, comments=True)[1:]
         if line.startswith(("roundel health", "roundel doctor")):

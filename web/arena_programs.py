@@ -55,7 +55,9 @@ class ArenaPrograms:
         with tempfile.TemporaryDirectory(prefix="roundel-up-") as temporary:
             path, end_s = Path(temporary) / "endpoints", time.monotonic() + START_S
             words = ["--config", str(self._folder.config), "--endpoints-file", str(path)]
-            self._supervisor.start("server", "fusion", [*words, *(["--listen", listen] if listen else [])])
+            words += ["--zone", self._config.zone] if self._config.zone else []
+            words += ["--listen", listen] if listen else []
+            self._supervisor.start("server", "fusion", words)
             while not path.exists():
                 self._supervisor.tend()
                 if "server" not in self._supervisor or stop.wait(POLL_S):

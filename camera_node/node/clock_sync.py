@@ -67,6 +67,11 @@ class ClockSync:
             return shared_ahead_ns - ahead_ns, 0.0
         return estimate and (estimate[0] - ahead_ns, estimate[1])
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the server has answered."""
+        return self.estimate() is not None
+
     def to_server(self, t_ns: int) -> int:
         """Convert this machine's Unix time to the server's; unchanged until the server answers."""
         estimate = self.estimate(t_ns)

@@ -49,8 +49,10 @@ BURST_BUFFER = 1 << 18  # for bursts of messages: a full buffer waits for an ack
 T = TypeVar("T")
 
 
-def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zenoh.Session:
-    """Open the server's session, which is the arena's Zenoh router.
+def open_router(
+    listen: Sequence[str], zenoh_config: Path | None = None, others: Sequence[str] = ()
+) -> zenoh.Session:
+    """Open the server's session, which is the arena's Zenoh router. It connects to `others`, and retries for ever.
 
     The operating system chooses the port of an endpoint such as tcp/127.0.0.1:0; `listening_endpoints` reads it.
 
@@ -66,6 +68,13 @@ def open_router(listen: Sequence[str], zenoh_config: Path | None = None) -> zeno
         "listen/timeout_ms": 0,
         "listen/exit_on_failure": True,
     }
+    if others:
+        options |= {
+            "connect/endpoints": list(others),
+            "connect/retry": RETRY,
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+        }
     if has_assigned_port(listen):
         options |= {"adminspace/enabled": True, "adminspace/permissions/read": True}
     try:

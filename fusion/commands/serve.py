@@ -31,13 +31,14 @@ class Serve:
     """robots.yaml."""
     rate_hz: float | None = None
     """Poses a second; without it the rate of the fastest camera."""
-    shard: str | None = None
-    """Such as 2/3, the second of three processes that share the robots; the first one listens."""
+    zone: str | None = None
+    """The name of this server's zone, of an arena with several servers (zones in arena.yaml)."""
 
     def run(self) -> int:
         """Serve until Ctrl-C or SIGTERM."""
         from fusion.server.arena_config import (  # not at the top: --help needs no GTSAM
             ArenaConfig,
+            in_zone,
             load_arena,
             override,
         )
@@ -45,7 +46,8 @@ class Serve:
 
         settings = asdict(self)
         path, endpoints_file = settings.pop("config"), settings.pop("endpoints_file")
-        config = override(load_arena(path) if path else ArenaConfig(), **settings)
+        config = in_zone(load_arena(path) if path else ArenaConfig(), settings.pop("zone"))
+        config = override(config, **settings)
         with stopped_by_signals() as stop, Server(config, stop) as server:
             if endpoints_file:
                 write_atomically(endpoints_file, "".join(f"{endpoint}\n" for endpoint in server.endpoints))

@@ -151,40 +151,6 @@ class RobotPoses(msgspec.Struct, frozen=True, kw_only=True):
             pose.check()
 
 
-class ShardPoses(msgspec.Struct, frozen=True, kw_only=True):
-    """The poses of all robots of one shard at `t_ns`, so that other shards do not use the detections of these robots.
-
-    Columns, one row a robot: `motion` (R, 13) <f8 position, quaternion wxyz, velocity and angular velocity;
-    `covariance` (R, 144) <f4; all as in `RobotPose`.
-    """
-
-    version: int = VERSION
-    t_ns: int
-    robots: tuple[str, ...]
-    states: tuple[TrackingState, ...]
-    motion: bytes
-    covariance: bytes
-
-    def check(self) -> None:
-        """Raise MessageError unless the columns' sizes agree, the numbers are in range and quaternions of length 1."""
-        n = len(self.robots)
-        if (len(self.states), len(self.motion), len(self.covariance)) != (n, 104 * n, 576 * n):
-            raise MessageError(f"the columns have other sizes than those of {n} robots")
-        motion, covariance = self.motions(), np.frombuffer(self.covariance, "<f4")
-        if not ((np.abs(motion) <= MAX_NUMBER).all() and np.isfinite(covariance).all()):
-            raise MessageError("the poses are out of range")
-        if not (np.abs(np.linalg.norm(motion[:, 3:7], axis=1) - 1.0) < QUATERNION_SLACK).all():
-            raise MessageError("a quaternion is not of length 1")
-
-    def motions(self) -> Array:
-        """(R, 13) positions, quaternions, velocities and angular velocities."""
-        return np.frombuffer(self.motion, "<f8").reshape(-1, 13)
-
-    def covariances(self) -> Array:
-        """(R, 12, 12)."""
-        return np.frombuffer(self.covariance, "<f4").reshape(-1, 12, 12).astype(float)
-
-
 class Markers(msgspec.Struct, frozen=True, kw_only=True):
     """All markers of a frame set, labeled and unlabeled.
 
@@ -375,7 +341,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def robots_key(arena: str) -> str:
-    """The key of the queryable that answers with `Robots`; it changes nothing."""
+    """The key of the queryable that answers with `Robots`, and on which the server publishes them after a change."""
     return f"{arena}/robots"
 
 
@@ -390,11 +356,6 @@ def set_robots_key(arena: str) -> str:
 def frames_key(arena: str) -> str:
     """The key on which the server publishes `FusedFrames` for every frame set."""
     return f"{arena}/fusion/frames"
-
-
-def shard_key(arena: str, index: int | str) -> str:
-    """The key on which shard `index`, of several, publishes `ShardPoses` for the others in every frame set."""
-    return f"{arena}/fusion/shard/{index}"
 
 
 class RobotsRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -416,11 +377,13 @@ class Robots(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         robots: by name.
         unsaved: names whose changes a restart of the server would undo.
+        renamed: by the change that is published: old name -> new name.
     """
 
     version: int = VERSION
     robots: dict[str, Robot]
     unsaved: tuple[str, ...] = ()
+    renamed: dict[str, str] = {}
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> "Robots":

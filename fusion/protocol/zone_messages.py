@@ -21,14 +21,13 @@ class Claim(NamedTuple):
 
     epoch: int
     zone: str
-    since_ns: int  # time of the last frame set before the zone's own
+    since_ns: int  # the zone publishes later poses; those until then are the previous owner's
 
 
 class ZoneReport(msgspec.Struct, frozen=True, kw_only=True):
     """What one zone knows of the owners of robots.
 
     Attributes:
-        zone: the sender.
         t_ns: increases from one report of a zone to the next.
         claims: the highest claim that the sender knows, by robot; of all robots, or of those that it owned last.
         lost: robots that the sender owns but does not see.
@@ -36,7 +35,6 @@ class ZoneReport(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     version: int = VERSION
-    zone: str
     t_ns: int
     claims: dict[str, Claim] = {}
     lost: tuple[str, ...] = ()
@@ -44,7 +42,7 @@ class ZoneReport(msgspec.Struct, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Raise MessageError unless names and epochs are possible."""
-        names = {self.zone, *self.claims, *self.lost, *self.follows, *(c.zone for c in self.claims.values())}
+        names = {*self.claims, *self.lost, *self.follows, *(c.zone for c in self.claims.values())}
         if not all(map(is_name, names)):
             raise MessageError("an invalid name of a zone or a robot")
         if not all(0 < claim.epoch < MAX_EPOCH for claim in self.claims.values()):
@@ -59,19 +57,17 @@ class ZoneStates(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     version: int = VERSION
-    zone: str
     t_ns: int
     robots: tuple[str, ...]
     motion: bytes
     covariance: bytes
 
     @classmethod
-    def of(cls, zone: str, t_ns: int, names: tuple[str, ...], states: States, rows: Index) -> "ZoneStates":
+    def of(cls, t_ns: int, names: tuple[str, ...], states: States, rows: Index) -> "ZoneStates":
         """The message of the robots in `rows`, of all N names and states."""
         selected = states.select(rows)
         motion = np.column_stack([selected.p, wxyz_from_rotation(selected.R), selected.v, selected.omega])
         return cls(
-            zone=zone,
             t_ns=t_ns,
             robots=tuple(names[k] for k in rows.tolist()),
             motion=motion.astype("<f8").tobytes(),
@@ -100,16 +96,18 @@ class ZoneStates(msgspec.Struct, frozen=True, kw_only=True):
         return np.frombuffer(self.motion, "<f8").reshape(-1, 13)
 
 
-def zone_alive_key(arena: str, zone: str = "*") -> str:
-    """The liveliness token of a zone's server."""
-    return f"{arena}/fusion/zone/{zone}/alive"
+def zone_key(arena: str, content: str, zone: str = "*") -> str:
+    """The key of what a zone's server publishes.
+
+    Args:
+        arena: the arena's name.
+        content: `alive` (a liveliness token), `report` (`ZoneReport`), `states/NAME` (`ZoneStates` for the zone NAME),
+            and for the first zone, which joins them, `markers` (`Markers`) and `status` (`FusionStatus`).
+        zone: the sender.
+    """
+    return f"{arena}/fusion/zone/{zone}/{content}"
 
 
-def zone_report_key(arena: str, zone: str = "*") -> str:
-    """The key on which a zone publishes `ZoneReport`."""
-    return f"{arena}/fusion/zone/{zone}/report"
-
-
-def zone_states_key(arena: str, to: str, zone: str = "*") -> str:
-    """The key on which a zone publishes `ZoneStates` for the zone `to`."""
-    return f"{arena}/fusion/zone/{zone}/states/{to}"
+def zone_of(key: str) -> str:
+    """The sender of a key that `zone_key` made."""
+    return key.split("/")[3]

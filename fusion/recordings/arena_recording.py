@@ -179,7 +179,7 @@ class ArenaRecorder:
     ) -> None:
         self.lost: Counter[str] = Counter()
         self.robots: frozenset[str] | None = None
-        self._named: frozenset[str] | None = None  # robots of the last status; a shard names its own
+        self._named: frozenset[str] | None = None  # robots of the last status
         self._connection, self._arena, self._writer = connection, arena, writer
         self._session: zenoh.Session | None = None
         self._subscriber: zenoh.Subscriber | None = None

@@ -161,7 +161,7 @@ class RigMonitor:
         Args:
             frame_set: with the frames of excluded cameras.
             now: the robots after the update with this frame set.
-            recalibrates: False for a shard that waits for the poses from another.
+            recalibrates: False for the server of a zone that takes the rig from another.
             is_doubtful: whether the frame set contradicts the predictions. When that begins, something changed: the
                 keyframes before do not show what is now.
         """

@@ -1,13 +1,33 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The live server's settings: `configs/arena.yaml`, all of them with defaults."""
 
+import difflib
+import re
+from collections import Counter
 from pathlib import Path
 
 import msgspec
 
 from camera_node.foundation.config import NAME_RULE, is_name, load_yaml
 from camera_node.foundation.errors import ConfigError
+from camera_node.protocol.session import LOOPBACK
 from fusion.model.limits import Limits
+
+ANY_HOST = re.compile(r"(\w+)/.*:(\d+)")
+
+
+class Zone(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A part of an arena with a server of its own.
+
+    Attributes:
+        name: a part of Zenoh keys, as names of cameras are.
+        server: the Zenoh endpoint at which the other servers and programs reach the zone's server.
+        cameras: the names of its cameras.
+    """
+
+    name: str
+    server: str
+    cameras: tuple[str, ...]
 
 
 class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -26,7 +46,8 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         audit: the file to which a line is appended for every change of rig and robots over the network.
         rate_hz: poses a second; without it the rate of the fastest camera.
         limits: see `Limits`.
-        shard: `2/3` for the second of three processes that share the robots; all but the first connect to `listen`.
+        zones: of an arena with several servers; the first one has the clock, the rig and the robots for all.
+        zone: the name of this server's zone.
     """
 
     arena: str = "arena"
@@ -40,7 +61,8 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     audit: str | None = None
     rate_hz: float | None = None
     limits: Limits = Limits()
-    shard: str = "1/1"
+    zones: tuple[Zone, ...] = ()
+    zone: str | None = None
 
     def __post_init__(self) -> None:
         if not is_name(self.arena):
@@ -49,6 +71,27 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ValueError(f"rate_hz is {self.rate_hz}; it must be within 0.1 and 1000")
         if not self.listen:
             raise ValueError("listen names no endpoint; give one such as tcp/0.0.0.0:7447")
+        self._require_zones()
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the arena's only server, or that of the first zone."""
+        return not self.zones or self.zones[0].name == self.zone
+
+    def _require_zones(self) -> None:
+        names = [zone.name for zone in self.zones]
+        if invalid := [name for name in names if not is_name(name)]:
+            raise ValueError(f"'{invalid[0]}' can't name a zone; {NAME_RULE}")
+        listed = Counter((*names, *(camera for zone in self.zones for camera in set(zone.cameras))))
+        if repeated := [name for name, count in listed.items() if count > 1]:
+            raise ValueError(
+                f"zones: '{repeated[0]}' is there twice; each zone has a name and cameras of its own"
+            )
+        if self.zone is not None and self.zone not in names:
+            similar = difflib.get_close_matches(self.zone, names, 1)
+            hint = f"did you mean {similar[0]}? " if similar else ""
+            known = f"the zones are {', '.join(names)}" if names else "arena.yaml has no zones"
+            raise ValueError(f"there is no zone '{self.zone}'; {hint}{known}")
 
     def saving_folders(self) -> tuple[Path, ...]:
         """The folders in which the server writes, each once."""
@@ -69,6 +112,28 @@ def load_arena(path: Path) -> ArenaConfig:
         if (value := getattr(config, name))
     }
     return override(config, **paths)
+
+
+def in_zone(config: ArenaConfig, name: str | None) -> ArenaConfig:
+    """The config of a zone's server, which listens at the port of the zone's address, on loopback only if that is.
+
+    Args:
+        config: of the arena.
+        name: of the zone; None without zones, or for the one that `config` names.
+
+    Raises:
+        ConfigError: there is no such zone, or the arena has zones and none is named.
+    """
+    if name is None:
+        if config.zones and config.zone is None:
+            names = ", ".join(zone.name for zone in config.zones)
+            raise ConfigError(f"arena '{config.arena}' has several servers: give --zone, one of {names}")
+        return config
+    config = override(config, zone=name)
+    (server,) = (zone.server for zone in config.zones if zone.name == name)
+    return override(
+        config, listen=(server if LOOPBACK.fullmatch(server) else ANY_HOST.sub(r"\1/0.0.0.0:\2", server),)
+    )
 
 
 def override(config: ArenaConfig, **settings: object) -> ArenaConfig:

@@ -56,7 +56,7 @@ TOGETHER_NS = 60_000_000_000  # recordings that start within this time after the
 
 
 class ArenaQueries:
-    """Answers the queries of an arena. Every shard answers for its robots, the leading one for the rig too.
+    """Answers the queries of an arena: its time, rig and robots; the only server, or that of the first zone.
 
     Args:
         keys: the arena's.
@@ -78,17 +78,13 @@ class ArenaQueries:
         self._clock, self._on_rig_change = clock, on_rig_change
 
     def declare(self, audit: AuditLog) -> None:
-        """Answer queries from now on; changes of robots are audited."""
+        """Answer queries from now on; changes are audited."""
         arena, transport = self._keys.arena, self._transport
         transport.answer_on_server_thread(robots_key(arena), self._answer_robots)
         change = audit.audited("change of robots", self._change_robots)
         transport.answer_on_server_thread(set_robots_key(arena), change)
         if isinstance(self._clock, ServerClock):
             transport.answer(self._keys.clock, partial(self._answer_clock, self._clock))
-
-    def declare_rig(self, audit: AuditLog) -> None:
-        """Answer queries for the rig and its history, and audited ones for changes of it."""
-        arena, transport = self._keys.arena, self._transport
         transport.answer(self._keys.rig, self._answer_rig, RateLimit(RIG_ANSWERS_HZ, RIG_ANSWERS_HZ))
         transport.answer_on_server_thread(rig_history_key(arena), self._answer_history)
         for key, change, answer, prepare in (
@@ -153,13 +149,17 @@ class ArenaQueries:
     def _change_robots(self, query: zenoh.Query) -> bytes:
         payload = payload_of(query)
         request = parse_request(payload, RobotsRequest)
+        before = self._pipeline.robots
         for name in self._pipeline.change_robots(request):
             self._transport.undeclare(self._keys.robot_pose(name))
+        if (robots := self._pipeline.robots) is not before:
+            changed = Robots(robots=robots, renamed=request.rename)
+            self._transport.publish(robots_key(self._keys.arena), changed)
         return self._robots_reply(payload)
 
 
 class CameraQueries:
-    """Answers the queries about cameras; the leading shard only.
+    """Answers the queries about cameras; the only server, or that of the first zone.
 
     Args:
         keys: the arena's.

@@ -16,8 +16,7 @@ from fusion.errors import FusionError
 from fusion.model.corrections import ExtrinsicsCorrection, corrected_camera
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.robots import Robot
-from fusion.protocol.pose_messages import RobotsRequest, ShardPoses
-from fusion.protocol.shards import Shard
+from fusion.protocol.pose_messages import Robots, RobotsRequest
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server_statistics import PipelineStatus
@@ -39,19 +38,20 @@ class TrackingPipeline:
 
     Args:
         config: the arena's files, rate and limits.
-        shard: the robots that this process estimates.
 
     Raises:
         ConfigError, FusionError, CalibrationError: a file is missing or broken, or declares robots that can't be
             tracked.
     """
 
-    def __init__(self, config: ArenaConfig, shard: Shard) -> None:
-        self._config, self._shard = config, shard
-        rig, saved_rig = (Path(file) if file else None for file in (config.rig, config.saved_rig))
+    def __init__(self, config: ArenaConfig) -> None:
+        self._config = config
+        files = (config.rig, config.saved_rig, config.robots, config.saved_robots)
+        rig, saved_rig, robots, saved_robots = (
+            Path(file) if file and config.leads else None for file in files
+        )
         self.active_rig = ActiveRig(rig, saved_rig)
-        saved_robots = Path(config.saved_robots) if config.saved_robots else None
-        self.active_robots = ActiveRobots(Path(config.robots), saved_robots)
+        self.active_robots = ActiveRobots(robots, saved_robots)
         self.tracker: Tracker | None
         self.synchronizer: FrameSynchronizer
         self.early: AssociatedFrames | None = None  # of the open frame set
@@ -115,7 +115,7 @@ class TrackingPipeline:
         self.active_rig.use(rig, now_ns, source)
 
     def follow_rig(self, message: RigMessage) -> None:
-        """Use the rig that the leading shard published; raises FusionError if it can't be used."""
+        """Use the rig that the first zone's server published; raises FusionError if it can't be used."""
         if self.active_rig.message is None or self.active_rig.message.t_ns != message.t_ns:
             self._use(message.rig, lambda: None)
             self.active_rig.message = message
@@ -173,12 +173,19 @@ class TrackingPipeline:
     def _start(self, cameras: dict[str, Camera]) -> None:
         """Restart tracking."""
         limits = self._config.limits
-        self.tracker = Tracker(cameras, self.robots, limits, self._shard) if cameras else None
+        self.tracker = Tracker(cameras, self.robots, limits, self._config.leads) if cameras else None
         self.judge_cameras_in(self._judging)
         self.pause_acquisition(self._is_wand_recorded)
         self.synchronizer = FrameSynchronizer.at_rate(self._config.rate_hz, limits.lateness_ms)
         if cameras:
             log.info("active calibration: %s", ", ".join(cameras))
+
+    def follow_robots(self, message: Robots) -> None:
+        """Use the robots that the first zone's server published; raises FusionError if they can't be tracked."""
+        if message.robots != self.robots:
+            self.active_robots.follow(message.robots)
+            if self.tracker is not None:
+                self.tracker = self.tracker.with_robots(self.robots, message.renamed)
 
     def change_robots(self, request: RobotsRequest) -> set[str]:
         """Rename, remove and define robots, all or none. Robots with unchanged markers stay tracked.
@@ -213,11 +220,6 @@ class TrackingPipeline:
         self._judging = executor
         if self.tracker is not None:
             self.tracker.monitors.rig.executor = executor
-
-    def add_shard_poses(self, poses: ShardPoses) -> None:
-        """Use the robots of another shard: their detections are not available to the robots of this one."""
-        if self.tracker is not None:
-            self.tracker.table.receive(poses)
 
     def associate_early(self) -> None:
         """Associate the frames of the open frame set while the last ones are missing."""

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from calib.rig.rig_messages import RigMessage
+from camera_node.foundation.errors import RoundelError
 from camera_node.foundation.folder_lock import locked_folder
 from camera_node.foundation.logs import about
 from camera_node.foundation.service import ServiceManager
@@ -31,24 +32,24 @@ from fusion.protocol.pose_messages import (
     Latency,
     RobotPose,
     RobotPoses,
-    ShardPoses,
+    Robots,
     TrackingState,
     frames_key,
-    shard_key,
+    robots_key,
 )
-from fusion.protocol.shards import Shard
 from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.arena_queries import ArenaQueries, CameraQueries
 from fusion.server.fair_use import FrameQuotas
 from fusion.server.frame_synchronizer import MAX_RATE_HZ
-from fusion.server.ingest import MAX_AGE_NS, Ingest
+from fusion.server.ingest import Ingest
 from fusion.server.pipeline import TrackingPipeline
 from fusion.server.server_clock import clock_of
 from fusion.server.server_statistics import ServerStatistics
 from fusion.server.storage.audit import AuditLog
 from fusion.server.storage.camera_registry import CameraRegistry
 from fusion.server.transport import INTERNAL_ERROR, Transport, open_session
+from fusion.server.zones.zone_exchange import ZoneExchange
 from fusion.tracking.result import TOO_MANY_UNASSIGNED, latency_of
 from fusion.tracking.tracker import Tracker
 
@@ -73,19 +74,18 @@ class Server:
     Raises, at entry:
         NetworkError: an endpoint is taken.
         ConfigError, FusionError, CalibrationError: a file is missing or broken, or declares robots that can't be
-            tracked; another server saves in one of the folders.
+            tracked; another server saves in one of the folders; the arena has zones, and `config` names none.
     """
 
     def __init__(self, config: ArenaConfig, stopped: threading.Event | None = None) -> None:
         self.config = config
         self.keys = Keys(config.arena)
         self.endpoints = config.listen
-        self.shard = Shard.parse(config.shard)
         self.statistics = ServerStatistics(config.limits.lateness_ms)
         with contextlib.ExitStack() as stack:
-            for folder in config.saving_folders() if self.shard.leads else ():
+            for folder in config.saving_folders() if config.leads else ():
                 stack.enter_context(locked_folder(folder, "server"))
-            self.pipeline = TrackingPipeline(config, self.shard)
+            self.pipeline = TrackingPipeline(config)
             self._closing = stack.pop_all()
         self._ingest = Ingest(self.keys, self.statistics)
         self._quotas = FrameQuotas(config.limits.lateness_ms, MAX_RATE_HZ)
@@ -95,17 +95,21 @@ class Server:
     def __enter__(self) -> "Server":
         with self._closing as stack:
             stack.callback(self.pipeline.active_rig.close)
-            self.session = stack.enter_context(open_session(self.config, self.shard))
-            if self.shard.leads:
-                self.endpoints = listening_endpoints(self.session, self.config.listen)
-            self.clock = clock_of(self.shard, self.session, self.keys)
+            self.session = stack.enter_context(open_session(self.config))
+            self.endpoints = listening_endpoints(self.session, self.config.listen)
+            self.clock = clock_of(self.config.leads, self.session, self.keys)
             stack.callback(self.clock.close)
             self.transport = Transport(self.session, self.clock, self._count_fault, stack)
+            self.zones = (
+                ZoneExchange(self.config, self.keys, self.pipeline, self.transport, self.statistics)
+                if self.config.zone
+                else None
+            )
             self._declare()
             self._closing = stack.pop_all()
-        verb = "listens on" if self.shard.leads else f"connects its shard {self.config.shard} to"
-        log.info("arena '%s' %s %s", self.config.arena, verb, " ".join(self.endpoints))
-        if self.pipeline.tracker is None:
+        zone = f"zone {self.config.zone} of " if self.config.zone else ""
+        log.info("%sarena '%s' listens on %s", zone, self.config.arena, " ".join(self.endpoints))
+        if self.pipeline.tracker is None and self.config.leads:
             log.warning("no camera has a pose yet; calibrate with roundel calibrate wand --live, see --help")
         return self
 
@@ -130,6 +134,7 @@ class Server:
                 now_ns = self.clock.now_ns()
                 with self._guarded("tracking"):
                     self._fuse(now_ns, is_backlogged)
+                    self._exchange(now_ns)
                 with self._guarded("the status"):
                     if status := self._report_status(now_ns):
                         service.report(describe_status(status))
@@ -141,15 +146,12 @@ class Server:
     def _declare(self) -> None:
         keys, transport = self.keys, self.transport
         self._update_quotas()
-        transport.subscribe_frames(keys.detections(), self._receive_detections, self._quotas)
-        transport.watch_token(keys.wand, self.pipeline.pause_acquisition)
-        if self.shard.count > 1:
-            transport.subscribe(shard_key(keys.arena, "*"), self._receive_shard)
-        audit = AuditLog(self.config.audit if self.shard.leads else None, self.session)
-        queries = ArenaQueries(keys, self.pipeline, transport, self.clock, self._update_quotas)
-        queries.declare(audit)
-        if self.shard.leads:
-            queries.declare_rig(audit)
+        self._subscribe_frames()
+        transport.watch_tokens(keys.wand, lambda _, is_there: self.pipeline.pause_acquisition(is_there))
+        if self.config.leads:
+            audit = AuditLog(self.config.audit, self.session)
+            queries = ArenaQueries(keys, self.pipeline, transport, self.clock, self._update_quotas)
+            queries.declare(audit)
             registry = CameraRegistry(
                 Path(self.config.cameras) if self.config.cameras else None, self._is_used
             )
@@ -159,6 +161,21 @@ class Server:
         else:
             transport.subscribe(keys.rig, self._follow_rig, _prepare_lenses)
             transport.subscribe(keys.fusion_status, self._request_new_rig)
+            transport.subscribe(robots_key(keys.arena), self._follow_robots)
+            transport.watch_tokens(keys.fusion_alive, self._request_robots)
+        if self.zones is not None:
+            self.zones.declare(self._subscribe_frames)
+
+    def _subscribe_frames(self) -> None:
+        """Subscribe to all cameras, or to those that this zone uses."""
+        names = ("*",) if self.zones is None else self.zones.member.used_cameras
+        frames = [self.keys.detections(name) for name in names]
+        self.transport.subscribe_frames(frames, self._receive_detections, self._quotas)
+
+    def _exchange(self, now_ns: int) -> None:
+        """Publish for the other zones, once the arena's time is known."""
+        if self.zones is not None and self.clock.is_known:
+            self.zones.publish(now_ns)
 
     def _limit_connections(self) -> None:
         """End connections of an address that has too many: Zenoh limits all sessions together."""
@@ -226,17 +243,20 @@ class Server:
     def _track_and_publish(self, tracker: Tracker, frame_set: FrameSet) -> None:
         """Publish the poses that acquisition can't change first, then everything else."""
         start_ns = self.clock.now_ns()
+        if self.zones is not None:
+            self.zones.member.begin(tracker.table, frame_set.t_ns)
         predicted = tracker.predict(frame_set.t_ns, self.pipeline.early)
         update = tracker.update(tracker.associate(predicted, frame_set), frame_set)
         latency = latency_of(frame_set, start_ns, self.clock.now_ns())
         publish_poses(self.transport, self.keys, update.poses.values(), latency)
-        if self.shard.count > 1:
-            self.transport.publish(shard_key(self.keys.arena, self.shard.index), tracker.table.shard_poses())
         result = tracker.finish(update)
         published = {pose.robot for pose in update.poses.values()}
         others = [pose for pose in result.poses if pose.robot not in published]
         publish_poses(self.transport, self.keys, others, latency)
-        if self.shard.leads:
+        if self.zones is not None:
+            self.zones.finish(tracker.table, result.markers)
+            self._exchange(self.clock.now_ns())
+        else:
             self.transport.publish(self.keys.markers, result.markers)
             self.transport.publish(frames_key(self.keys.arena), FusedFrames.of(frame_set))
         for correction in tracker.check_extrinsics(frame_set):
@@ -247,7 +267,7 @@ class Server:
         self.statistics.count_frame_set(result.cameras, states, latency.total_ms if latency else None)
 
     def _report_correction(self, correction: ExtrinsicsCorrection) -> None:
-        """Log a moved camera; publish the rig once the camera is recalibrated, by the leading shard."""
+        """Log a moved camera; publish the rig once the camera is recalibrated, by the server that has the rig."""
         if correction.camera is None:
             self.statistics.note_moved(correction.name)
             return
@@ -265,8 +285,10 @@ class Server:
         if not self.statistics.is_due(now_ns):
             return None
         status = self.statistics.report(now_ns, self.pipeline.status())
-        key = self.keys.fusion_status + ("" if self.shard.leads else f"/{self.shard.index}")
-        self.transport.publish(key, status)
+        if self.zones is not None:
+            self.zones.publish_status(status)
+        else:
+            self.transport.publish(self.keys.fusion_status, status)
         self._update_quotas()
         return status
 
@@ -291,33 +313,37 @@ class Server:
         self.statistics.note_lateness(name, is_on_time, age_ns * 1e-6)
 
     def _follow_rig(self, data: bytes, key: str, received_ns: int) -> None:
-        """Use the rig of the leading shard."""
+        """Use the rig of the first zone's server."""
         try:
             self.pipeline.follow_rig(decode(data, RigMessage))
         except (MessageError, FusionError) as error:
             self.statistics.count_fault("unusable rig")
-            log.warning("the rig of the first shard is not used: %s", error)
+            log.warning("the rig of the first zone is not used: %s", error)
 
     def _request_new_rig(self, data: bytes, key: str, received_ns: int) -> None:
-        """Request the rig of the leading shard if its status tells that it is another one."""
+        """Request the rig of the first zone's server if its status tells that it is another one."""
         with contextlib.suppress(MessageError):
             active, t_ns = self.pipeline.active_rig.message, decode(data, FusionStatus).rig_t_ns
             if t_ns is not None and (active is None or active.t_ns != t_ns):
                 self.transport.request(self.keys.rig, self._follow_rig, _prepare_lenses)
 
-    def _receive_shard(self, data: bytes, key: str, received_ns: int) -> None:
-        """Receive the poses of another shard's robots."""
-        if key == shard_key(self.keys.arena, self.shard.index):
-            return
+    def _follow_robots(self, data: bytes, key: str, received_ns: int) -> None:
+        """Use the robots of the first zone's server."""
+        assert self.zones is not None
         try:
-            poses = decode(data, ShardPoses)
-        except MessageError:
-            self.statistics.count_fault("undecodable shard poses")
-            return
-        if abs(poses.t_ns - received_ns) > MAX_AGE_NS:
-            self.statistics.count_fault("implausible time")
+            robots = decode(data, Robots)
+            self.pipeline.follow_robots(robots)
+        except (MessageError, RoundelError) as error:
+            self.statistics.count_fault("unusable robots")
+            log.warning("the robots of the first zone are not used: %s", error)
         else:
-            self.pipeline.add_shard_poses(poses)
+            self.zones.member.ownership.rename(robots.renamed)
+
+    def _request_robots(self, key: str, is_alive: bool) -> None:
+        """Request the robots and the rig of the first zone's server once it is there."""
+        if is_alive:
+            self.transport.request(robots_key(self.keys.arena), self._follow_robots)
+            self.transport.request(self.keys.rig, self._follow_rig, _prepare_lenses)
 
 
 def publish_poses(

@@ -11,7 +11,6 @@ import zenoh
 from camera_node.clocks.host_clock import clock_id, unix_ahead_ns
 from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.messages import ClockReply, Keys
-from fusion.protocol.shards import Shard
 
 
 class ServerClock:
@@ -32,10 +31,15 @@ class ServerClock:
         """The answer to a query for the time."""
         return ClockReply(t_ns=self.now_ns(), clock=clock_id(), monotonic_ahead_ns=self.ahead_ns)
 
+    @property
+    def is_known(self) -> bool:
+        """True; as `ClockSync.is_known`."""
+        return True
+
     def close(self) -> None:
         """Nothing to close; as `ClockSync.close`."""
 
 
-def clock_of(shard: Shard, session: zenoh.Session, keys: Keys) -> ServerClock | ClockSync:
-    """The leading shard defines the arena's time; the others follow it, as cameras do."""
-    return ServerClock() if shard.leads else ClockSync(session, keys).start()
+def clock_of(leads: bool, session: zenoh.Session, keys: Keys) -> ServerClock | ClockSync:
+    """The first zone's server defines the arena's time; the others follow it, as cameras do."""
+    return ServerClock() if leads else ClockSync(session, keys).start()

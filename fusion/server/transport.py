@@ -4,7 +4,7 @@
 import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -12,20 +12,17 @@ from typing import TypeVar
 import msgspec
 import zenoh
 
-from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.node.clock_sync import ClockSync
 from camera_node.protocol.messages import encode
 from camera_node.protocol.requests import REQUEST_S, payload_of, respond
-from camera_node.protocol.session import guarded, has_assigned_port, open_client, open_router
-from fusion.protocol.shards import Shard
+from camera_node.protocol.session import guarded, open_router
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.fair_use import FrameQuotas, Preparation, Task, TaskQueue
 from fusion.server.server_clock import ServerClock
 
 log = logging.getLogger("fusion")
 MESSAGES = 256  # queued, of one key that is not a camera's
-LEADER_S = 30.0  # for the leading shard to listen
 REQUESTS = 16  # queued, of one key
 ABOVE_QUOTA = "frames above the quota"
 TOO_SLOW = "messages that the server was too slow for"
@@ -35,21 +32,16 @@ Prepare = Callable[[bytes], object]
 T = TypeVar("T")
 
 
-def open_session(config: ArenaConfig, shard: Shard) -> zenoh.Session:
-    """Open the arena's router in the leading shard, a connection to it in any other.
+def open_session(config: ArenaConfig) -> zenoh.Session:
+    """Open the arena's router; that of a zone connects to those of the zones before it, and retries for ever.
 
     Raises:
         NetworkError: an endpoint is taken.
-        ConfigError: a shard that does not lead would connect to port 0.
     """
+    names = [zone.name for zone in config.zones]
+    before = config.zones[: names.index(config.zone)] if config.zone else ()
     zenoh_config = Path(config.zenoh) if config.zenoh else None
-    if shard.leads:
-        return open_router(config.listen, zenoh_config)
-    if has_assigned_port(config.listen):
-        raise ConfigError(
-            f"shard {config.shard} connects to {' '.join(config.listen)}; give the first shard's port in --listen"
-        )
-    return open_client([e.replace("0.0.0.0", "127.0.0.1") for e in config.listen], zenoh_config, LEADER_S)
+    return open_router(config.listen, zenoh_config, [zone.server for zone in before])
 
 
 class Transport:
@@ -76,6 +68,8 @@ class Transport:
         closing.callback(self._preparation.close)
         self.received_ns = 0  # arrival time of the last message that was handled
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._frames: dict[str, zenoh.Subscriber] = {}  # subscribers of `subscribe_frames`
+        closing.callback(self._end_frames)
 
     def subscribe(self, key: str, handle: MessageHandler, prepare: Prepare | None = None) -> None:
         """Call `handle(data, key, received_ns)` for each message, on the server's thread.
@@ -92,8 +86,8 @@ class Transport:
 
         self._declare_subscriber(key, enqueue)
 
-    def subscribe_frames(self, key: str, handle: MessageHandler, quotas: FrameQuotas) -> None:
-        """The same for the frames of cameras, each within its quota."""
+    def subscribe_frames(self, keys: Collection[str], handle: MessageHandler, quotas: FrameQuotas) -> None:
+        """The same for the frames of cameras on these keys and no others, each within its quota."""
 
         def enqueue(sample: zenoh.Sample) -> None:
             key = str(sample.key_expr)
@@ -103,7 +97,10 @@ class Transport:
             else:
                 self._count_fault(ABOVE_QUOTA, key)
 
-        self._declare_subscriber(key, enqueue)
+        for key in self._frames.keys() - set(keys):
+            self._frames.pop(key).undeclare()
+        for key in set(keys) - self._frames.keys():
+            self._frames[key] = self.session.declare_subscriber(key, self._guarded(key, enqueue))
 
     def request(self, key: str, handle: MessageHandler, prepare: Prepare | None = None) -> None:
         """Query a key; call `handle(data, key, received_ns)` for each reply, on the server's thread.
@@ -149,12 +146,12 @@ class Transport:
 
         self.answer(key, take)
 
-    def watch_token(self, key: str, handle: Callable[[bool], object]) -> None:
-        """Call `handle` on the server's thread with whether the liveliness token is there, now and on each change."""
+    def watch_tokens(self, key: str, handle: Callable[[str, bool], object]) -> None:
+        """Call `handle(key, is_alive)` on the server's thread for each liveliness token, now and on each change."""
 
         def enqueue(sample: zenoh.Sample) -> None:
-            is_alive = sample.kind == zenoh.SampleKind.PUT
-            self.enqueue(lambda: handle(is_alive))
+            token, is_alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            self.enqueue(lambda: handle(token, is_alive))
 
         subscriber = self.session.liveliness().declare_subscriber(key, enqueue, history=True)
         self._closing.callback(subscriber.undeclare)
@@ -194,6 +191,10 @@ class Transport:
         if task.is_request:
             self._tasks.charge_request(time.monotonic() - begun_s)
         return self._tasks.has_messages()
+
+    def _end_frames(self) -> None:
+        for subscriber in self._frames.values():
+            subscriber.undeclare()
 
     def _declare_subscriber(self, key: str, enqueue: Callable[[zenoh.Sample], object]) -> None:
         subscriber = self.session.declare_subscriber(key, self._guarded(key, enqueue))

@@ -41,7 +41,7 @@ class Acquired:
         displaced: single-marker robots whose detections belong to an acquired constellation.
         assignments: of all robots, including the acquired ones.
         markers: triangulated markers that stay unlabeled.
-        reasons: why the other missing robots of this shard were not acquired, by row.
+        reasons: why the other missing robots were not acquired, by row.
         crowded: cameras whose unassigned detections were too many to search all of them.
     """
 
@@ -66,16 +66,15 @@ class Acquisition:
     Args:
         cameras: cameras of the rig.
         estimator: of all robots.
-        leads: whether this shard reports the unlabeled markers, and so needs them in every frame set.
 
     Attributes:
         search: finds markers among unassigned detections.
     """
 
-    def __init__(self, cameras: CameraArray, estimator: Estimator, leads: bool) -> None:
-        self._cameras, self._estimator, self._leads = cameras, estimator, leads
+    def __init__(self, cameras: CameraArray, estimator: Estimator) -> None:
+        self._cameras, self._estimator = cameras, estimator
         self._turn = 0  # row of the first constellation to search for, if there are too many
-        self.search, self._weak = MarkerSearch(cameras, leads), WeakFits()
+        self.search, self._weak = MarkerSearch(cameras), WeakFits()
 
     def acquire(
         self,
@@ -94,8 +93,6 @@ class Acquisition:
             assignments: of the tracked robots.
             histories: of unlabeled markers before this frame set.
         """
-        if not len(missing) and not self._leads:
-            return Acquired.none(table, assignments)
         bodies, singles = missing[~table.single[missing]], missing[table.single[missing]]
         # A marker of a constellation may be assigned to a single-marker robot: its assignments are searched too.
         is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))
@@ -130,7 +127,7 @@ class Acquisition:
         detections: DetectionTable,
         assignments: Assignments,
     ) -> tuple[list[RefinedFits], dict[int, str]]:
-        """The constellations of this shard that the markers identify, and why the others are not among them."""
+        """The constellations that the markers identify, and why the others are not among them."""
         if not len(missing):
             return [], {}
         turn = self._turn
@@ -149,9 +146,9 @@ class Acquisition:
             self._turn = int(rows[-1]) + 1
         n_frame_sets, t_ns = self.search.n_frame_sets, table.t_ns or 0
         confirmed = self._weak.confirm(identified.weak, t_ns, n_frame_sets)
-        found = [fits.select(table.owned[fits.robot]) for fits in (*identified.fits, *confirmed)]
+        found = [*identified.fits, *confirmed]
         acquired = {k for fits in found for k in fits.robot.tolist()}
-        left = [k for k in missing[table.owned[missing]].tolist() if k not in acquired]
+        left = [k for k in missing.tolist() if k not in acquired]
         return found, {k: _reason(table, k, question, identified) for k in left}
 
     def _acquire_singles(

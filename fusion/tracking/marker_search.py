@@ -294,15 +294,14 @@ class MarkerSearch:
 
     Args:
         cameras: cameras of the rig.
-        leads: whether this shard reports markers that no robot declares.
 
     Attributes:
         n_frame_sets: with unassigned detections, so far.
         is_due: whether unassigned detections stay, so that a search is worth its time also where no robot is missing.
     """
 
-    def __init__(self, cameras: CameraArray, leads: bool) -> None:
-        self._cameras, self._leads = cameras, leads
+    def __init__(self, cameras: CameraArray) -> None:
+        self._cameras = cameras
         self.n_frame_sets = 0
         self._has_others = False  # whether the last search for other sizes found markers
         self._has_found = True  # whether the last search found markers
@@ -334,7 +333,7 @@ class MarkerSearch:
         portion = Portion(limit, self.n_frame_sets, float(np.median(diameters)))
         rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
         markers = find_markers(self._cameras, detections, rows, diameters)
-        if self._leads and len(declared) and (self._has_others or self.n_frame_sets % OTHERS_EVERY == 0):
+        if len(declared) and (self._has_others or self.n_frame_sets % OTHERS_EVERY == 0):
             others = self._find_other_sizes(detections, rows, markers, diameters)
             self._has_others = len(others) > 0
             markers += others

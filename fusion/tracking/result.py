@@ -100,8 +100,8 @@ class TrackingResult:
     """The result of one frame set.
 
     Attributes:
-        poses: of the robots of this shard that were acquired at least once.
-        markers: all markers, labeled and unlabeled; the labeled ones only from the leading shard.
+        poses: of the robots of this server that were acquired at least once.
+        markers: all markers, labeled and unlabeled; of the labeled ones those of its robots.
         cameras: by name.
         assignments: of the detections of all admitted cameras.
         summary: which cameras observed which robots.
@@ -139,7 +139,7 @@ def latency_of(frame_set: FrameSet, begun_ns: int, done_ns: int) -> Latency | No
 def robot_poses(
     table: TrackTable, cameras: CameraArray, t_ns: int, summary: ObservationSummary, rows: list[int]
 ) -> dict[int, RobotPose]:
-    """The poses by row of those robots in `rows` that this shard owns and that were acquired at least once."""
+    """The poses by row of those robots in `rows` that this server publishes and that were acquired at least once."""
     if not rows:
         return {}
     states, names, status = table.states, cameras.names, table.status

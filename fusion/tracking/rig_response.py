@@ -67,6 +67,10 @@ class RigResponse:
             added_px2,
         )
 
+    def forget(self, rows: Index) -> None:
+        """The errors of robots (rows) that start from a state of unknown origin follow none of the cameras."""
+        self.responses[rows], self.counted[rows] = 0.0, 0.0
+
     def restart(self, states: States, rows: Index, observations: MatchedObservations) -> None:
         """Robots (rows) that these observations located, without a prediction.
 
@@ -75,7 +79,7 @@ class RigResponse:
             rows: the robots.
             observations: of these only.
         """
-        self.responses[rows], self.counted[rows] = 0.0, 0.0
+        self.forget(rows)
         A, nu = self._estimator.innovations(states, observations)
         equations = np.concatenate([A, nu[:, None]], 1).reshape(-1, 2, 13)
         weights = 1 / (_core.NOMINAL_WEIGHT * (1 + np.sum(equations[:, :, 12] ** 2, 1) / _core.CAUCHY**2))

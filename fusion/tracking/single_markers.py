@@ -40,14 +40,14 @@ class _Reach:
 def choose_markers(
     table: TrackTable, missing: Index, markers: list[Marker], histories: Histories
 ) -> MarkerChoice:
-    """Choose markers for the missing single-marker robots of this shard: each the only one for the other."""
+    """Choose markers for the missing single-marker robots: each the only one for the other."""
     choice = MarkerChoice({}, {})
     if not len(missing):
         return choice
     history = histories(markers)
     reach = _reach(table, missing, markers, history)
-    for row in np.flatnonzero(table.owned[missing]).tolist():
-        k, options = int(missing[row]), np.flatnonzero(reach.chosen[row])
+    for row, k in enumerate(missing.tolist()):
+        options = np.flatnonzero(reach.chosen[row])
         others = np.flatnonzero(reach.chosen[:, options[0]]) if len(options) == 1 else np.empty(0, np.intp)
         if len(others) == 1 and (table.is_local(k) or _is_watched(history, options[0])):
             choice.pairs[k] = int(options[0])

@@ -9,16 +9,15 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, MarkerTable
 from fusion.model.robots import Robot
-from fusion.model.states import MAX_COAST_S, POSITION, THETA, States
-from fusion.protocol.pose_messages import ShardPoses, TrackingState
-from fusion.protocol.shards import Shard, shard_poses_of, states_of
-from fusion.tracking.gating import START_S, START_SIGMAS
+from fusion.model.states import MAX_COAST_S, POSITION, THETA, States, predict
+from fusion.protocol.pose_messages import TrackingState
+from fusion.protocol.zone_messages import ZoneStates
+from fusion.tracking.gating import POSITION_GATE, START_S, START_SIGMAS
 
 ASSOCIATED_M = 0.1  # position sigma above which a robot is acquired again instead of associated
 ASSOCIATED_RAD = 0.15  # rotation sigma above which a constellation is: its markers may be exchanged
 START_M = 0.1  # standard deviation of `start_m`
 LOCAL_M = 0.3  # position sigma above which a history does not say where a robot is
-MAX_SHARD_MESSAGES = 1000  # of other shards, between two frame sets
 
 
 class TrackTable:
@@ -28,20 +27,21 @@ class TrackTable:
         names, robots, markers: the robots and their marker table.
         single: (N,) robots with a single marker.
         densities: of their accelerations; see `MotionModel.densities`.
-        owned: (N,) robots that this shard estimates.
+        owned: (N,) robots whose poses this server publishes; all of them in an arena without zones.
+        searched: (N,) robots that it acquires while they are missing; the others belong to other zones.
         states: at `t_ns`; a new object after each change.
         status: None for a robot that was never acquired.
         claimed: (N, 12, 12) covariances of the states with the errors of the cameras, which the states' own lack.
         t_ns: time of the last frame set, or None before the first.
     """
 
-    def __init__(self, robots: dict[str, Robot], limits: Limits, shard: Shard) -> None:
+    def __init__(self, robots: dict[str, Robot], limits: Limits) -> None:
         n = len(robots)
         self.names, self.robots = tuple(robots), list(robots.values())
         self.markers = MarkerTable.of(self.robots)
         self.single = np.array([robot.is_single for robot in self.robots], bool)
         self.densities = [robot.densities for robot in self.robots]
-        self.owned = np.array([shard.owns(name) for name in self.names], bool)
+        self.owned, self.searched = np.ones((2, n), bool)
         self.states = States.at_rest(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), START_SIGMAS)
         self.claimed = self.states.P
         self.status: list[TrackingState | None] = [None] * n
@@ -49,7 +49,7 @@ class TrackTable:
         self._limits = limits
         self._row = {name: k for k, name in enumerate(robots)}
         self._seen, self._seen_ns = np.zeros(n, bool), np.zeros(n, np.int64)
-        self._messages: list[ShardPoses] = []  # of other shards since the last prediction
+        self._received: dict[str, ZoneStates] = {}  # the last one of each zone since it was applied
 
     @property
     def alive(self) -> Mask:
@@ -121,14 +121,12 @@ class TrackTable:
         self.t_ns = t_ns
         seen = np.zeros(len(self.robots), bool)
         seen[self.markers.robot[assignments.marker]] = True
-        self._seen, self._seen_ns[seen & self.owned] = seen, t_ns
+        self._seen, self._seen_ns[seen] = seen, t_ns
         silent = (t_ns - self._seen_ns) * 1e-9 > self._limits.lost_after_s
         uncertain = self._is_uncertain()
         newly_lost = []
         for k, status in enumerate(self.status):
-            if not self.owned[k]:
-                self.status[k] = "lost" if status is not None and silent[k] else status
-            elif seen[k]:
+            if seen[k]:
                 self.status[k] = "coasting" if uncertain[k] else "tracked"
             elif status in ("tracked", "coasting"):
                 self.status[k] = "lost" if silent[k] else "coasting"
@@ -164,32 +162,36 @@ class TrackTable:
         arms, covariances = self.marker_positions(rows)
         return self.states.p[self.markers.robot[rows]] + arms, covariances
 
-    def shard_poses(self) -> ShardPoses:
-        """The poses of this shard's robots for the other shards; valid after the first frame set."""
-        assert self.t_ns is not None
-        known = np.array([status is not None for status in self.status], bool)
-        return shard_poses_of(
-            self.names, self.t_ns, self.states, self.status, np.flatnonzero(known & self.owned)
-        )
+    def receive(self, zone: str, states: ZoneStates) -> None:
+        """Take the states of another zone's robots with the next prediction after their time."""
+        self._received[zone] = states
 
-    def receive(self, poses: ShardPoses) -> None:
-        """Queue another shard's poses; `apply_received` takes them."""
-        if len(self._messages) < MAX_SHARD_MESSAGES:
-            self._messages.append(poses)
+    def apply_received(self) -> Index:
+        """Track robots of other zones from the states that their owners sent, predicted to the last frame set.
 
-    def apply_received(self) -> None:
-        """Take the received states of other shards' robots, predicted to the last frame set."""
-        messages, self._messages = self._messages, []
-        if self.t_ns is None:
-            return
-        for message in messages:
+        A robot that is tracked already stays as it is, unless it is somewhere else: its owner is right.
+
+        Returns:
+            rows of the robots with other states.
+        """
+        t_ns, started = self.t_ns or 0, [np.empty(0, np.intp)]
+        for zone in [zone for zone, message in self._received.items() if message.t_ns <= t_ns]:
+            message = self._received.pop(zone)
             at = np.array([self._row.get(name, -1) for name in message.robots], np.intp)
-            new = np.flatnonzero((at >= 0) & ~self.owned[at] & (message.t_ns > self._seen_ns[at]))
-            self.states = self.states.with_rows(at[new], states_of(message, self.t_ns).select(new))
-            self._seen_ns[at[new]] = message.t_ns
-            for k in new.tolist():
-                self.status[at[k]] = message.states[k]
-                self._seen[at[k]] = message.states[k] == "tracked"
+            known = np.flatnonzero((at >= 0) & ~self.owned[at])
+            rows, dt = at[known], np.full(len(known), (t_ns - message.t_ns) * 1e-9)
+            densities = np.array([self.densities[k] for k in rows.tolist()]).reshape(-1, 2)
+            states, _ = predict(message.states().select(known), dt, densities, self.single[rows])
+            differ = [self._differs(k, states.p[i], states.P[i]) for i, k in enumerate(rows.tolist())]
+            new = np.flatnonzero(~self.alive[rows] | np.array(differ, bool))
+            self.adopt(rows[new], states.select(new))
+            self._seen[rows[new]], self._seen_ns[rows[new]] = True, message.t_ns
+            started.append(rows[new])
+        return np.concatenate(started)
+
+    def _differs(self, k: int, p: Array, P: Array) -> bool:
+        """Whether a robot is not at p."""
+        return self.history_chi2(k, p, P[POSITION, POSITION]) > POSITION_GATE
 
     def _stop(self, rows: list[int]) -> None:
         """Set the velocities of robots to zero."""

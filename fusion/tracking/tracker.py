@@ -18,7 +18,6 @@ from fusion.monitoring.camera_monitors import CameraMonitors
 from fusion.monitoring.frame_consistency import AssignedFrames
 from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
 from fusion.protocol.pose_messages import RobotPose
-from fusion.protocol.shards import Shard
 from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import AssociatedFrames, Association, OwnDetections
 from fusion.tracking.claim_check import ClaimCheck
@@ -77,7 +76,7 @@ class Tracker:
         cameras: the placed cameras, by name; frame sets must not contain frames of others.
         robots: by name, as `load_robots` validated them.
         limits: see `Limits`.
-        shard: which of the robots this process estimates; `table.receive` takes the others.
+        recalibrates: whether this server corrects the poses of moved cameras, not another zone's.
 
     Attributes:
         acquires_none: while the wand is recorded: its markers are no robots. Tracked robots continue.
@@ -88,11 +87,11 @@ class Tracker:
         cameras: dict[str, Camera],
         robots: dict[str, Robot],
         limits: Limits | None = None,
-        shard: Shard = Shard(),  # noqa: B008 frozen
+        recalibrates: bool = True,
     ) -> None:
         self.cameras = CameraArray(cameras)
-        self.limits, self.shard = limits or Limits(), shard
-        self.table = TrackTable(robots, self.limits, shard)
+        self.limits, self._recalibrates = limits or Limits(), recalibrates
+        self.table = TrackTable(robots, self.limits)
         densities = np.array([robot.densities for robot in robots.values()]).reshape(
             -1, 2
         )  # without robots too
@@ -100,7 +99,7 @@ class Tracker:
         self.own = OwnDetections(self.cameras, self.estimator, self.table.markers)
         self.robust = RobustUpdate(self.estimator, self.table.markers)
         self.rig_response = RigResponse(self.estimator)
-        self.acquisition = Acquisition(self.cameras, self.estimator, shard.leads)
+        self.acquisition = Acquisition(self.cameras, self.estimator)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
         self.monitors = CameraMonitors(self.cameras, self.table.markers, self.table.single, densities)
@@ -134,7 +133,7 @@ class Tracker:
         """
         if early is not None and early.association.is_of(t_ns, self.cameras, self.table.markers):
             return early
-        self.table.apply_received()
+        self.rig_response.forget(self.table.apply_received())
         dt = np.full(len(self.table.robots), self.table.interval_s(t_ns))
         prediction = self.estimator.predict(self.table.states, dt)
         tracked = self.table.associable(prediction.states)
@@ -203,7 +202,7 @@ class Tracker:
     def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection, ...]:
         """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
         now = Snapshot(frame_set.t_ns, self.table.states, self.table.tracked)
-        return self.monitors.check_extrinsics(frame_set, now, self.shard.leads, self.robust.is_doubtful)
+        return self.monitors.check_extrinsics(frame_set, now, self._recalibrates, self.robust.is_doubtful)
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
@@ -216,7 +215,7 @@ class Tracker:
             robots: the new robots, by name.
             renamed: old name -> new name.
         """
-        other = Tracker(self.cameras.as_dict(), robots, self.limits, self.shard)
+        other = Tracker(self.cameras.as_dict(), robots, self.limits, self._recalibrates)
         other.monitors.inherit(self.monitors)
         other.robust.inherit(self.robust)
         other.acquires_none = self.acquires_none
@@ -225,8 +224,8 @@ class Tracker:
         return other
 
     def not_acquired(self) -> dict[str, str]:
-        """Why the robots of this shard that are neither tracked nor coasting were not acquired, by name."""
-        missing = np.flatnonzero(self.table.owned & ~self.table.alive).tolist()
+        """Why the robots that are neither tracked nor coasting were not acquired, by name."""
+        missing = np.flatnonzero(self.table.searched & ~self.table.alive).tolist()
         default = PAUSED if self.acquires_none else "not searched for yet"
         return {self.table.names[k]: self._reasons.get(k, default) for k in missing}
 
@@ -262,27 +261,22 @@ class Tracker:
     def _update_states(
         self, associated: AssociatedFrames, detections: DetectionTable, assignments: Assignments
     ) -> Assignments:
-        """Update the states of owned robots; returns the assignments that fit, with residuals."""
+        """Update the states of the robots; returns the assignments that fit, with residuals."""
         prediction, tracked = associated.prediction, associated.tracked
         given = AssignedFrames(
             associated.association.t_ns, prediction.states, tracked, detections, assignments
         )
-        are_own = self.own.are_own(given)
-        of_shard = self.table.owned[self.table.markers.robot[assignments.marker]]
-        others, assignments = assignments.select(~of_shard), assignments.select(of_shard & are_own)
-        fitted = self.robust.update(prediction, detections, assignments)
+        fitted = self.robust.update(prediction, detections, assignments.select(self.own.are_own(given)))
         self.table.states = fitted.states
         self.rig_response.update(fitted, self.robust.added_px2)
         self._claim()
-        return fitted.assignments.joined(others)
+        return fitted.assignments
 
     def _acquire(self, update: Update) -> tuple[Update, Acquired]:
         """Acquire missing robots; returns the update with their assignments."""
         if not update.is_searched:
             return update, Acquired.none(self.table, update.assignments)
-        missing = np.flatnonzero(~update.tracked)
-        if self.acquires_none or not self.table.owned[missing].any():  # other shards acquire their own
-            missing = missing[:0]
+        missing = np.flatnonzero(~update.tracked & self.table.searched & (not self.acquires_none))
         histories = partial(self.unlabeled.histories, update.t_ns)
         found = self.acquisition.acquire(
             self.table, missing, update.detections, update.assignments, histories
@@ -306,9 +300,9 @@ class Tracker:
         return replace(update, assignments=found.assignments, summary=summary), found
 
     def _track_unlabeled(self, update: Update, markers: list[Marker]) -> UnlabeledMarkers:
-        """Track the remaining markers; the leading shard adds those that only one camera sees."""
+        """Track the remaining markers, and those that only one camera sees."""
         seen = self.unlabeled.track(update.t_ns, update.detections, markers)
-        if not (self.shard.leads and update.is_searched):
+        if not update.is_searched:
             return seen
         used = np.concatenate([update.assignments.detection, seen.detections])
         rows = self.single_view.confirm(update.t_ns, update.detections, used)
@@ -324,7 +318,7 @@ class Tracker:
         table, summary, t_ns = self.table, update.summary, update.t_ns
         rest = [k for k in np.flatnonzero(table.owned).tolist() if k not in update.poses]
         poses = update.poses | robot_poses(table, self.cameras, t_ns, summary, rest)
-        marker_cameras = summary.marker_cameras & self.shard.leads
+        marker_cameras = summary.marker_cameras & table.owned[table.markers.robot][:, None]
         return TrackingResult(
             t_ns,
             tuple(poses[k] for k in sorted(poses)),

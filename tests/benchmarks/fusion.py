@@ -85,13 +85,9 @@ def _accuracies(thorough: bool) -> Iterator[Row]:
 
 
 def _capacities(thorough: bool) -> Iterator[Row]:
-    loads = [(FULL, 1), (replace(FULL, robots=100), 2)]
-    if thorough:
-        loads += [(replace(FULL, robots=robots), 1) for robots in (60, 70, 80)]
-    for load, shards in loads:
-        got = capacity(load, 10.0 if thorough else 2.0, shards)
+    for load in (FULL, *(replace(FULL, robots=robots) for robots in ((60, 70, 80) if thorough else ()))):
+        got = capacity(load, 10.0 if thorough else 2.0)
         name = f"{load.robots} robots x {load.markers} x {load.cameras} cameras at {load.hz:g} Hz"
-        name += f", {shards} shards" if shards > 1 else ""
         goal = "5, 15 ms" if load is FULL else ""
         yield (
             f"{name}: from the last detection to the poses, p50 and p99",

@@ -21,11 +21,10 @@ import numpy as np
 import tyro
 
 from camera_node.foundation.arrays import Array
-from camera_node.protocol.messages import Detections, Keys, decode, encode
+from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
-from fusion.protocol.pose_messages import Latency, RobotPose, ShardPoses, TrackingState
-from fusion.protocol.shards import Shard
+from fusion.protocol.pose_messages import Latency, RobotPose, TrackingState
 from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Ingest
@@ -58,17 +57,13 @@ class Capacity:
     tracked: float
 
 
-def capacity(load: Load, seconds: float, shards: int = 1) -> Capacity:
-    """Measure a load for `seconds`; with several shards, each on its own core, the worst of each figure."""
+def capacity(load: Load, seconds: float) -> Capacity:
+    """Measure a load for `seconds`."""
     with collecting_between_frame_sets():
-        queues = [Queue(load, seconds, Shard(k + 1, shards)) for k in range(shards)]
+        queue = Queue(load, seconds)
         for message in load.messages(seconds):
-            sent = [queue.step(message, message.t_ns + DELAY_NS) for queue in queues]
-            for k, queue in enumerate(queues):
-                queue.receive([message for other in (*sent[:k], *sent[k + 1 :]) for message in other])
-    each = [queue.sum_up(seconds) for queue in queues]
-    worst = {name: max(getattr(c, name) for c in each) for name in Capacity.__slots__}
-    return Capacity(**worst | {"tracked": min(c.tracked for c in each)})
+            queue.step(message, message.t_ns + DELAY_NS)
+    return queue.sum_up(seconds)
 
 
 def compare(loads: Sequence[Load], seconds: float) -> list[Capacity]:
@@ -110,7 +105,6 @@ class Queue:
     Args:
         load: robots and cameras.
         seconds: of the load.
-        shard: the robots of this server.
         pace: factor of the measured processor times, to simulate a faster or a slower machine.
         use: is called with the time of a publication, and its poses.
     """
@@ -119,14 +113,13 @@ class Queue:
         self,
         load: Load,
         seconds: float,
-        shard: Shard = Shard(),  # noqa: B008 frozen
         pace: float = 1.0,
         use: Callable[[int, Sequence[RobotPose]], None] | None = None,
     ) -> None:
         self.load, self.pace, self._use = load, pace, use
         self._keys, self._statistics = Keys("load"), ServerStatistics(Limits().lateness_ms)
         self._ingest = Ingest(self._keys, self._statistics)
-        self.tracker = Tracker(load.rig, load.bodies, shard=shard)
+        self.tracker = Tracker(load.rig, load.bodies)
         self.tracker.monitors.rig.executor = JudgeProcess()
         self.synchronizer = FrameSynchronizer(round(1e9 / load.hz))
         self.free_ns = self.busy_ns = self._first_ns = self._collected_ns = 0
@@ -136,8 +129,8 @@ class Queue:
         self._warm = False
         self._early: AssociatedFrames | None = None
 
-    def step(self, message: Detections, arrival_ns: int) -> list[bytes]:
-        """Process a message; returns the messages for other shards. The first `START_S` seconds do not count."""
+    def step(self, message: Detections, arrival_ns: int) -> bool:
+        """Process a message; return whether that completed a frame set. The first `START_S` seconds do not count."""
         data, key = encode(message), self._keys.detections(message.camera)
         self._first_ns = self._first_ns or arrival_ns
         if not self._warm and arrival_ns - self._first_ns > START_S * 1e9:
@@ -147,16 +140,12 @@ class Queue:
         if self.free_ns < arrival_ns:
             self._spend(self._associate_early)
         self.free_ns = max(self.free_ns, arrival_ns)
-        sent = self._take(data, key, arrival_ns)
+        is_complete = self._take(data, key, arrival_ns)
         if arrival_ns - self._collected_ns > 1e9:
             self._spend(gc.collect)
             self._spend(lambda: self._statistics.report(arrival_ns, PipelineStatus()))
             self._collected_ns = arrival_ns
-        return sent
-
-    def receive(self, messages: Sequence[bytes]) -> None:
-        """Receive the robots of other shards."""
-        self._spend(lambda: [self.tracker.table.receive(decode(message, ShardPoses)) for message in messages])
+        return is_complete
 
     def sum_up(self, seconds: float) -> Capacity:
         """The measured figures."""
@@ -168,18 +157,16 @@ class Queue:
         )
         return Capacity(cost_ms, quiet_ms, p50, p99, cpu, float(np.mean(self.tracked.numbers)))
 
-    def _take(self, data: bytes, key: str, arrival_ns: int) -> list[bytes]:
+    def _take(self, data: bytes, key: str, arrival_ns: int) -> bool:
         self._spend(lambda: self._add(data, key, arrival_ns))
-        out: list[bytes] = []
-        for frame_set in self._spend(lambda: self.synchronizer.take(arrival_ns)):
+        frame_sets = self._spend(lambda: self.synchronizer.take(arrival_ns))
+        for frame_set in frame_sets:
             update = self._spend(lambda frame_set=frame_set: self._update(frame_set))
             first = list(update.poses.values())
             self._spend(lambda first=first: self._encode(first))
             done_ns = self.free_ns
             if self._use is not None:
                 self._use(done_ns, first)
-            if self.tracker.shard.count > 1:
-                out.append(self._spend(lambda: encode(self.tracker.table.shard_poses())))
             result = self._spend(lambda update=update: self.tracker.finish(update))
             published = {pose.robot for pose in first}
             if rest := [pose for pose in result.poses if pose.robot not in published]:
@@ -192,8 +179,8 @@ class Queue:
             states: dict[str, TrackingState] = {pose.robot: pose.state for pose in result.poses}
             self._statistics.count_frame_set(result.cameras, states, None)
             count = sum(state == "tracked" for state in states.values())
-            self.tracked.append(count / max(int(self.tracker.table.owned.sum()), 1))
-        return out
+            self.tracked.append(count / max(len(self.tracker.table.names), 1))
+        return bool(frame_sets)
 
     def _update(self, frame_set: FrameSet) -> Update:
         associated = self.tracker.associate(self.tracker.predict(frame_set.t_ns, self._early), frame_set)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import tyro
 
-from fusion.protocol.shards import Shard
 from fusion.server.server import collecting_between_frame_sets
 from tests.benchmarks.fusion_capacity import DELAY_NS, Queue
 from tests.benchmarks.fusion_load import START_NS, Load
@@ -23,30 +22,22 @@ class ColdStart:
     wrong: int
 
 
-def cold_start(load: Load, seconds: float, shards: int) -> ColdStart:
-    """The first `seconds` of a server, by processor time of its processes, each on its own core; see `Queue`."""
-    queues = [Queue(load, seconds, Shard(k + 1, shards)) for k in range(shards)]
+def cold_start(load: Load, seconds: float) -> ColdStart:
+    """The first `seconds` of a server, by processor time; see `Queue`."""
+    queue = Queue(load, seconds)
     start_ns, done_s, most, wrong = 0, math.inf, 0, 0
     with collecting_between_frame_sets():
         for message in load.messages(seconds):
             arrival_ns = message.t_ns + DELAY_NS
             start_ns = start_ns or arrival_ns
-            sent = [queue.step(message, arrival_ns) for queue in queues]
-            for k, queue in enumerate(queues):
-                queue.receive([m for other in (*sent[:k], *sent[k + 1 :]) for m in other])
-            if not any(sent) and shards > 1:
+            if not queue.step(message, arrival_ns):
                 continue
-            tracked = sum(_count(queue) for queue in queues)
-            wrong += sum(_count_wrong(queue) for queue in queues)
+            tracked = int(queue.tracker.table.tracked.sum())
+            wrong += _count_wrong(queue)
             most = max(most, tracked)
             if tracked == load.robots and math.isinf(done_s):
-                done_s = (max(queue.free_ns for queue in queues) - start_ns) * 1e-9
+                done_s = (queue.free_ns - start_ns) * 1e-9
     return ColdStart(done_s, most / load.robots, wrong)
-
-
-def _count(queue: Queue) -> int:
-    table = queue.tracker.table
-    return int((table.tracked & table.owned).sum())
 
 
 def _count_wrong(queue: Queue) -> int:
@@ -55,20 +46,19 @@ def _count_wrong(queue: Queue) -> int:
         return 0
     truth = queue.load.paths.at((table.t_ns - START_NS) * 1e-9)
     off = np.linalg.norm(table.states.p - truth.p, axis=1) > WRONG_M
-    return int((off & table.tracked & table.owned).sum())
+    return int((off & table.tracked).sum())
 
 
-def main(robots: int = 200, shards: int = 2, seconds: float = 1.5, seeds: int = 3) -> None:
+def main(robots: int = 200, seconds: float = 1.5, seeds: int = 3) -> None:
     """Print the time until all robots are tracked, for several arenas.
 
     Args:
         robots: of 4 markers each, before 8 cameras at 60 Hz.
-        shards: processes that share the robots.
         seconds: of the simulated start.
         seeds: arenas.
     """
     for seed in range(1, seeds + 1):
-        got = cold_start(Load(robots, 4, 8, 60.0, seed=seed), seconds, shards)
+        got = cold_start(Load(robots, 4, 8, 60.0, seed=seed), seconds)
         print(
             f"seed {seed}: all tracked after {got.seconds:.2f} s, at most {got.tracked:.1%}; {got.wrong} wrong poses",
             flush=True,

@@ -16,7 +16,7 @@ from camera_node.foundation.config import dump_yaml
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits
-from fusion.server.arena_config import ArenaConfig
+from fusion.server.arena_config import ArenaConfig, Zone
 from fusion.server.server import Server
 from tests.conftest import ROOT
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, line
@@ -45,6 +45,11 @@ def config(folder: Path, with_rig: bool = True, lateness_ms: float = 5000) -> Ar
         robots=str(folder / "robots.yaml"),
         limits=Limits(lateness_ms=lateness_ms),
     )
+
+
+def zones_of(cameras: dict[str, tuple[str, ...]], endpoint: str) -> tuple[Zone, ...]:
+    """Zones with the names of their cameras; other zones reach the first one's server at an endpoint."""
+    return tuple(Zone(name=name, server=endpoint, cameras=names) for name, names in cameras.items())
 
 
 @contextmanager

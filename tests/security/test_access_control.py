@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Every rule of configs/zenoh/server.json5, with real clients of each role.
 
-A shard's session, which has all rights, observes which messages of a client the server lets through. Denied messages
+A server's session, which has all rights, observes which messages of a client the server lets through. Denied messages
 precede an allowed one on the same link, so they would arrive before it.
 """
 
@@ -19,7 +19,16 @@ CAMERAS = ("north", "south")
 SERVER_READS = ("clock", "rig", "rig/history", "robots")
 SERVER_CHANGES = ("rig/set", "rig/undo", "rig/redo", "robots/set")
 CAMERA_KEYS = ("detections", "relative", "status", "alive", "snapshot", "settings", "@preview")
-PUBLISHED = ("markers", "robot/a/pose", "@poses", "fusion/status", "fusion/shard/2", "fusion/alive", "rig")
+PUBLISHED = (
+    "markers",
+    "robot/a/pose",
+    "@poses",
+    "fusion/status",
+    "fusion/zone/b/report",
+    "fusion/zone/b/states/a",
+    "fusion/alive",
+    "rig",
+)
 ALL = frozenset(
     {f"camera/{camera}/{key}" for camera in CAMERAS for key in CAMERA_KEYS}
     | {*SERVER_READS, *SERVER_CHANGES, *PUBLISHED, "calib/wand", "demo/progress", "other"}
@@ -169,7 +178,7 @@ def test_a_client_sends_what_its_role_may_send(lab: Lab, observer: Observer, nam
 
 @each_client
 def test_a_client_answers_its_own_requests_only(lab: Lab, observer: Observer, name: str, mode: str):
-    """It declares a queryable on every key, and one on all keys; a shard asks all queryables."""
+    """It declares a queryable on every key, and one on all keys; a server asks all queryables."""
     session = open_session(lab, name, mode)
 
     def answer(query: zenoh.Query) -> None:
@@ -186,7 +195,7 @@ def test_a_client_answers_its_own_requests_only(lab: Lab, observer: Observer, na
 
 @each_client
 def test_a_client_receives_what_its_role_may_receive(lab: Lab, observer: Observer, name: str, mode: str):
-    """A shard publishes on every key; the client subscribes to each, and to all. A query to the client follows."""
+    """A server publishes on every key; the client subscribes to each, and to all. A query to the client follows."""
     session, received = open_session(lab, name, mode), Inbox()
     subscribers = [
         session.declare_subscriber(

@@ -105,7 +105,7 @@ def test_an_unknown_certificate_cannot_be_revoked(tmp_path: Path):
 
 @contextlib.contextmanager
 def collecting(lab: Lab, key: str) -> Iterator[Inbox]:
-    """The payloads that a shard's session, which has all rights, receives on a key."""
+    """The payloads that a server's session, which has all rights, receives on a key."""
     inbox = Inbox()
     session = lab.session("server")
     subscriber = session.declare_subscriber(key, lambda sample: inbox.put(sample.payload.to_bytes()))

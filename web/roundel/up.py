@@ -20,7 +20,7 @@ from camera_node.foundation.supervisor import Supervisor
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER
 from camera_node.sources.frame import SourceSettings
-from fusion.server.arena_config import ArenaConfig, load_arena
+from fusion.server.arena_config import ArenaConfig, in_zone, load_arena
 from web.arena_folder import ArenaFolder
 from web.arena_programs import ArenaPrograms
 from web.view import check_port
@@ -44,6 +44,8 @@ class RunArena:
     """The arena's name, for a new folder; arena unless given."""
     listen: str | None = None
     """The server's Zenoh endpoint; that of arena.yaml unless given, in a new folder tcp/0.0.0.0:7447."""
+    zone: str | None = None
+    """The name of this server's zone, of an arena with several servers (zones in arena.yaml)."""
     local: bool = False
     """For a new folder: serve programs of this machine only."""
     headless: bool = False
@@ -60,7 +62,7 @@ class RunArena:
             check_port(self.host, self.port)
         folder = ArenaFolder(self.folder)
         is_new = folder.create(self.arena or LOCAL_SERVER.arena, self.listen, self.local)
-        config = load_arena(folder.config)
+        config = in_zone(load_arena(folder.config), self.zone)
         if self.arena not in (None, config.arena):
             raise ConfigError(
                 f"the arena in {self.folder} is called {config.arena}; change its name in {folder.config}, or name "

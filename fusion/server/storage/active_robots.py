@@ -19,7 +19,7 @@ class ActiveRobots:
     """The robots in use. Faults of the file that saves them are logged and never fatal.
 
     Args:
-        given: robots.yaml.
+        given: robots.yaml; None to `follow` another server.
         saved: the file that saves changed robots; if it is `given`, it may be missing or empty. None saves nothing.
 
     Attributes:
@@ -29,7 +29,7 @@ class ActiveRobots:
         ConfigError, FusionError: the given file is missing or broken, or declares robots that can't be tracked.
     """
 
-    def __init__(self, given: Path, saved: Path | None) -> None:
+    def __init__(self, given: Path | None, saved: Path | None) -> None:
         self._given, self._saved = given, saved
         self._given_digest = file_digest(given)
         self._known = file_digest(saved)  # of the saved file as this server read or wrote it
@@ -37,8 +37,19 @@ class ActiveRobots:
         self.robots = self._load(given)
         self._durable = self.robots  # those that a restart would load
 
-    def _load(self, given: Path) -> dict[str, Robot]:
+    def follow(self, robots: dict[str, Robot]) -> None:
+        """Use the robots of another server, which saves them.
+
+        Raises:
+            FusionError: they can't be tracked.
+        """
+        require_trackable(robots, "robots of the first zone", self.robots.keys())
+        self.robots = self._durable = robots
+
+    def _load(self, given: Path | None) -> dict[str, Robot]:
         """The saved robots, or the given ones if the user changed them after the others were saved."""
+        if given is None:
+            return {}
         if self._saved == given:
             return load_saved_robots(given) if given.exists() else {}
         if self._saved is None or not self._saved.exists():

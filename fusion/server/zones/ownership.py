@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from fusion.protocol.zone_messages import Claim, ZoneReport
 
 NOBODY = Claim(0, "", 0)
+HANDOVER_NS = 50_000_000  # from a handover's message to the new owner's first pose, on a busy machine
 
 
 class Ownership:
@@ -32,6 +33,8 @@ class Ownership:
         self._mine: set[str] = set()  # robots that this zone owned at the last report or owns
         self._lost: frozenset[str] = frozenset()
         self._follows: frozenset[str] = frozenset()
+        self._handed_over: dict[str, Claim] = {}  # the last handover of each robot by this zone
+        self._t_ns = self._interval_ns = 0  # of the last frame set, and since the one before
 
     @property
     def others(self) -> frozenset[str]:
@@ -39,31 +42,33 @@ class Ownership:
         return frozenset(self._alive)
 
     def note_alive(self, zone: str, is_alive: bool) -> None:
-        """Take note that another zone's server is there, or is not any more."""
+        """Take note that another zone's server is there, or is not any more: its robots that this zone tracks are taken
+        at once, from the next frame set."""
         if is_alive:
             self._alive.add(zone)
         else:
             self._alive.discard(zone)
             self._reports.pop(zone, None)
+            self._claim_free(self._follows)
 
-    def receive(self, report: ZoneReport) -> None:
+    def receive(self, zone: str, report: ZoneReport) -> None:
         """Take the claims of another zone's report; a late one can't take any back."""
-        if report.zone == self._zone:
-            return
         for robot, claim in report.claims.items():
             self.claims[robot] = max(claim, self.claims.get(robot, NOBODY))
-        last = self._reports.get(report.zone)
-        if report.zone in self._alive and (last is None or report.t_ns > last.t_ns):
-            self._reports[report.zone] = report
+        last = self._reports.get(zone)
+        if zone in self._alive and (last is None or report.t_ns > last.t_ns):
+            self._reports[zone] = report
 
     def owns(self, robot: str) -> bool:
         """Whether this zone owns a robot."""
         return self._claim(robot).zone == self._zone
 
     def publishes(self, robot: str, t_ns: int) -> bool:
-        """Whether this zone publishes the robot's pose at `t_ns`: it owns it, and the previous owner published none."""
+        """Whether this zone publishes the robot's pose at `t_ns`: it owns it by then, or hands it over later."""
         claim = self._claim(robot)
-        return claim.zone == self._zone and t_ns > claim.since_ns
+        if claim.zone == self._zone:
+            return t_ns > claim.since_ns
+        return t_ns <= claim.since_ns and claim == self._handed_over.get(robot)
 
     def searches(self, robot: str) -> bool:
         """Whether this zone searches for a robot that it does not see: no other zone owns it and sees it."""
@@ -76,8 +81,6 @@ class Ownership:
     def step(self, t_ns: int, tracked: Iterable[str], lost: Iterable[str], better: Mapping[str, str]) -> bool:
         """Claim robots that nobody owns, and hand over own ones, after a frame set.
 
-        A zone claims nothing before it has heard what every living zone owns.
-
         Args:
             t_ns: time of the frame set.
             tracked: robots that this zone sees.
@@ -88,13 +91,14 @@ class Ownership:
             whether claims changed.
         """
         tracked, before = set(tracked), dict(self.claims)
-        if self._alive <= self._reports.keys():
-            for robot in tracked:
-                if not self.owns(robot) and self._is_free(robot):
-                    self.claims[robot] = Claim(self._claim(robot).epoch + 1, self._zone, t_ns)
+        interval_ns, self._t_ns = t_ns - self._t_ns, t_ns
+        period_ns, self._interval_ns = min(interval_ns, self._interval_ns), interval_ns  # also after a pause
+        self._claim_free(tracked)
         for robot, zone in better.items():
-            if self.publishes(robot, t_ns) and zone in self.followers(robot):
-                self.claims[robot] = Claim(self._claim(robot).epoch + 1, zone, t_ns)
+            claim = self._claim(robot)
+            if claim.zone == self._zone and t_ns > claim.since_ns and zone in self.followers(robot):
+                since_ns = t_ns + _whole_periods(HANDOVER_NS, period_ns)
+                self.claims[robot] = self._handed_over[robot] = Claim(claim.epoch + 1, zone, since_ns)
         self._lost = frozenset(robot for robot in lost if self.owns(robot))
         self._follows = frozenset(robot for robot in tracked if not self.owns(robot))
         return self.claims != before
@@ -106,18 +110,23 @@ class Ownership:
         if of_all:
             self._mine = {robot for robot in claims if self.owns(robot)}
         return ZoneReport(
-            zone=self._zone,
             t_ns=t_ns,
             claims=claims,
             lost=tuple(sorted(self._lost)),
             follows=tuple(sorted(self._follows)),
         )
 
-    def rename(self, renamed: Mapping[str, str], known: Iterable[str]) -> None:
-        """Continue with other robots; `renamed` maps old names to new ones."""
-        claims = {renamed.get(robot, robot): claim for robot, claim in self.claims.items()}
-        self.claims = {robot: claims[robot] for robot in known if robot in claims}
-        self._mine = {renamed.get(robot, robot) for robot in self._mine}
+    def rename(self, renamed: Mapping[str, str]) -> None:
+        """Continue with robots that have other names; `renamed` maps old names to new ones."""
+        for before in renamed.keys() & self.claims.keys():
+            claim, after = self.claims[before], renamed[before]
+            self.claims[after] = max(claim, self._claim(after))
+
+    def _claim_free(self, robots: Iterable[str]) -> None:
+        """Claim those of some robots that nobody owns, if every living zone has said what it owns."""
+        for robot in robots if self._alive <= self._reports.keys() else ():
+            if self._is_free(robot):
+                self.claims[robot] = Claim(self._claim(robot).epoch + 1, self._zone, self._t_ns)
 
     def _claim(self, robot: str) -> Claim:
         return self.claims.get(robot, NOBODY)
@@ -129,3 +138,8 @@ class Ownership:
             return False
         report = self._reports.get(owner)
         return owner not in self._alive or (report is not None and robot in report.lost)
+
+
+def _whole_periods(least_ns: int, period_ns: int) -> int:
+    """Periods and a quarter, `least_ns` or longer: after a frame set and before the next one, also if that is late."""
+    return -(-least_ns // max(period_ns, 1)) * period_ns + period_ns // 4

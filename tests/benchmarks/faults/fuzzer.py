@@ -158,7 +158,7 @@ class Fuzzer:
                 (assigned_key(self.arena, name), {"version": 1, "id": name, "name": name, "settings": {}}),
                 (self.keys.markers, self._sample("/markers")),
                 (self.keys.fusion_status, self._sample("/fusion/status")),
-                (f"{self.arena}/fusion/shard/2", self._sample("/pose")),
+                (f"{self.arena}/fusion/zone/b/report", self._sample("/pose")),
                 (
                     f"{self.arena}/demo/progress",
                     {"version": 1, "t_ns": 0, "text": "x", "share": 0.5, "true_points": {}},

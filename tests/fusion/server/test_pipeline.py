@@ -7,7 +7,6 @@ import msgspec
 
 from calib.rig.rig import Rig
 from fusion.model.frames import CalibratedFrame
-from fusion.protocol.shards import Shard
 from fusion.server.pipeline import TrackingPipeline
 from tests.fusion.serving import ARENA, config
 
@@ -30,7 +29,7 @@ def with_a_clock_that_jumped(pipeline: TrackingPipeline) -> None:
 
 def test_a_restart_of_tracking_keeps_the_corrections_of_clocks(tmp_path: Path):
     """Before: every frame set without a solution made the stamps of a corrected camera wrong again."""
-    pipeline = TrackingPipeline(config(tmp_path), Shard())
+    pipeline = TrackingPipeline(config(tmp_path))
     with_a_clock_that_jumped(pipeline)
     before = pipeline.status().clocks
     assert before["cam0"].state != "correct"
@@ -39,7 +38,7 @@ def test_a_restart_of_tracking_keeps_the_corrections_of_clocks(tmp_path: Path):
 
 
 def test_a_rig_with_another_camera_without_a_pose_changes_no_track(tmp_path: Path):
-    pipeline = TrackingPipeline(config(tmp_path), Shard())
+    pipeline = TrackingPipeline(config(tmp_path))
     tracker = pipeline.tracker
     unplaced = msgspec.structs.replace(ARENA.cameras["cam0"], T_world_cam=None)
     pipeline.replace_rig(Rig(cameras={**ARENA.cameras, "new": unplaced}), 1)

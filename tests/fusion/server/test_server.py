@@ -18,6 +18,7 @@ from camera_node.protocol.messages import ClockReply, decode, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import FusionStatus, RobotPose, RobotPoses
+from fusion.server.arena_config import in_zone, override
 from fusion.server.server import Server
 from fusion.server.transport import TOO_SLOW
 from tests.conftest import ROOT
@@ -33,6 +34,7 @@ from tests.fusion.serving import (
     send,
     send_until_tracked,
     serving,
+    zones_of,
 )
 from tests.processes import running
 from tests.waiting import DEADLINE_S, Inbox, wait_for
@@ -181,10 +183,29 @@ def test_a_server_on_port_0_writes_the_endpoint_that_clients_reach(tmp_path):
             assert rig.cameras == ARENA.cameras
 
 
-def test_another_shard_does_not_connect_to_port_0(tmp_path):
-    settings = msgspec.structs.replace(config(tmp_path), listen=("tcp/127.0.0.1:0",), shard="2/2")
-    with pytest.raises(ConfigError, match="2/2 connects to tcp/"), Server(settings):
-        pass
+def test_an_unknown_zone_is_refused_with_the_known_ones(tmp_path):
+    zones = zones_of({"west": ("cam0",), "east": ("cam1",)}, "tcp/hall:7447")
+    settings = override(config(tmp_path), zones=zones)
+    with pytest.raises(ConfigError, match=r"no zone 'wset'; did you mean west\? the zones are west, east"):
+        in_zone(settings, "wset")
+    with pytest.raises(ConfigError, match="give --zone, one of west, east"):
+        in_zone(settings, None)
+    with pytest.raises(ConfigError, match=r"arena\.yaml has no zones"):
+        in_zone(config(tmp_path), "west")
+    assert in_zone(settings, "east").listen == ("tcp/0.0.0.0:7447",)
+
+
+@pytest.mark.parametrize(
+    ("zones", "fault"),
+    [
+        ({"a": ("cam0",), "b": ("cam0",)}, "'cam0' is there twice"),
+        ({"a/b": ("cam0",)}, "can't name a zone"),
+        ({"cam0": ("cam0",)}, "'cam0' is there twice"),
+    ],
+)
+def test_zones_have_names_and_cameras_of_their_own(tmp_path, zones: dict, fault: str):
+    with pytest.raises(ConfigError, match=fault):
+        override(config(tmp_path), zones=zones_of(zones, "tcp/hall:7447"))
 
 
 def test_a_client_waits_no_longer_than_its_timeout(tmp_path):

@@ -27,7 +27,7 @@ from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
-from tests.fusion.serving import ARENA, config, connected, send_until_tracked, serving
+from tests.fusion.serving import ARENA, config, connected, send_until_tracked, serving, zones_of
 from tests.processes import run_program
 from tests.waiting import DEADLINE_S, wait_for
 
@@ -339,19 +339,25 @@ def test_a_broken_saved_rig_does_not_prevent_a_start(
         assert client.rig(DEADLINE_S) == GIVEN
 
 
-def test_another_shard_follows_the_rig_of_the_first(tmp_path: Path):
-    """It starts after the first change, which it learns from the status."""
-    settings = msgspec.structs.replace(saving(tmp_path), shard="1/2")
+def test_the_server_of_another_zone_follows_the_rig_and_the_robots_of_the_first(
+    tmp_path: Path, endpoint: str
+):
+    """It starts after the first change."""
+    zones = zones_of({"west": ("cam0", "cam1"), "east": ("cam2", "cam3")}, endpoint)
+    settings = msgspec.structs.replace(saving(tmp_path), listen=(endpoint,), zones=zones, zone="west")
     with serving(settings) as (leader, client):
         client.set_rig(numbered(1))
-        second = msgspec.structs.replace(settings, listen=leader.endpoints, shard="2/2")
+        second = msgspec.structs.replace(settings, listen=("tcp/127.0.0.1:0",), zone="east")
         with serving(second) as (follower, _):
             wait_for(lambda: follower.pipeline.active_rig.rig == numbered(1))
+            wait_for(lambda: follower.pipeline.robots == leader.pipeline.robots)
+            client.change_robots(rename={"a": "b"})
+            wait_for(lambda: list(follower.pipeline.robots) == ["b"])
             client.set_rig(FEWER)
             wait_for(lambda: follower.pipeline.active_rig.rig == FEWER)
             client.undo_rig()
             wait_for(lambda: follower.pipeline.active_rig.rig == numbered(1))
-            assert client.redo_rig().rig == FEWER, "the other shard wrote no files"
+            assert client.redo_rig().rig == FEWER, "the other server wrote no files"
 
 
 def test_a_viewer_that_missed_a_publication_requests_the_rig(tmp_path: Path):

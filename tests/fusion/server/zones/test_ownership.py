@@ -22,7 +22,7 @@ Sees = Callable[[str, str, int], bool]
 Better = Callable[[str, str, int], str | None]
 
 
-@dataclass
+@dataclass(eq=False)
 class Zone:
     """A server: its ownership, and the poses that it published."""
 
@@ -88,11 +88,11 @@ class Hall:
         self._at(t_ns + PERIOD_NS, lambda: self._frame_set(zone))
 
     def _publish(self, zone: Zone, data: bytes) -> None:
-        for other in self.zones.values():
+        for other in [other for other in self.zones.values() if other is not zone]:
             for delay_ns in self.deliver():
                 self._at(
                     self.now_ns + delay_ns,
-                    lambda other=other: other.ownership.receive(decode(data, ZoneReport)),
+                    lambda other=other: other.ownership.receive(zone.name, decode(data, ZoneReport)),
                 )
 
 
@@ -164,7 +164,7 @@ def nearer(zone: str, robot: str, t_ns: int) -> str | None:
     return best if best != zone else None
 
 
-def test_poses_have_no_gap_above_two_frame_sets_and_no_double():
+def test_poses_have_no_gap_and_no_double():
     """Of 20 s of crossings between two zones with other times of frame sets. Who publishes a pose sees the robot."""
     hall = Hall("ab", crossing, nearer, lambda: [LATENCY_NS])
     hall.run(24 * 10**9)
@@ -177,7 +177,7 @@ def test_poses_have_no_gap_above_two_frame_sets_and_no_double():
         )
         changes = [(one[0], other[0]) for one, other in pairwise(poses) if one[1] != other[1]]
         assert len(changes) > 5
-        assert max(later - t_ns for (t_ns, _), (later, _) in pairwise(poses)) <= 2 * PERIOD_NS
+        assert max(later - t_ns for (t_ns, _), (later, _) in pairwise(poses)) <= 1.25 * PERIOD_NS
         assert all(later - t_ns >= 2 * EXCHANGE * PERIOD_NS for (_, t_ns), (later, _) in pairwise(changes)), (
             "twice"
         )
@@ -188,12 +188,12 @@ def test_two_zones_that_find_a_robot_at_once_agree_after_one_message_each():
     first, second = Ownership("a"), Ownership("b")
     for one, name in ((first, "b"), (second, "a")):
         one.note_alive(name, True)
-        one.receive(ZoneReport(zone=name, t_ns=0))
+        one.receive(name, ZoneReport(t_ns=0))
         assert one.step(1, ["r"], [], {})
         assert one.owns("r")
         assert not one.publishes("r", 1), "before the others have heard of it"
-    first.receive(second.report(1, False))
-    second.receive(first.report(1, False))
+    first.receive("b", second.report(1, False))
+    second.receive("a", first.report(1, False))
     assert not first.owns("r")
     assert second.publishes("r", 2)
 
@@ -203,28 +203,25 @@ def test_a_zone_claims_nothing_before_it_has_heard_the_living_zones():
     late = Ownership("b")
     late.note_alive("a", True)
     assert not late.step(1, ["r"], [], {})
-    late.receive(ZoneReport(zone="a", t_ns=1, claims={"r": Claim(7, "a", 0)}))
+    late.receive("a", ZoneReport(t_ns=1, claims={"r": Claim(7, "a", 0)}))
     assert not late.step(2, ["r"], [], {})
     late.note_alive("a", False)
-    assert late.step(3, ["r"], [], {}), "of the dead zone"
-    assert late.claims["r"] == Claim(8, "b", 3)
+    assert late.claims["r"] == Claim(8, "b", 2), "of the dead zone"
+    assert late.publishes("r", 3)
 
 
 def test_a_robot_that_its_owner_lost_is_searched_by_all():
     zone = Ownership("b")
     zone.note_alive("a", True)
-    zone.receive(
-        ZoneReport(zone="a", t_ns=1, claims={"r": Claim(1, "a", 0), "s": Claim(1, "a", 0)}, lost=("s",))
-    )
+    zone.receive("a", ZoneReport(t_ns=1, claims={"r": Claim(1, "a", 0), "s": Claim(1, "a", 0)}, lost=("s",)))
     assert (zone.searches("r"), zone.searches("s"), zone.searches("new")) == (False, True, True)
-    zone.receive(ZoneReport(zone="a", t_ns=0, lost=("r",)))
+    zone.receive("a", ZoneReport(t_ns=0, lost=("r",)))
     assert not zone.searches("r"), "a report that is late"
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"zone": "a/b"},
         {"claims": {"r": Claim(0, "a", 0)}},
         {"claims": {"r": Claim(1 << 62, "a", 0)}},
         {"claims": {"r": Claim(1, "*", 0)}},
@@ -232,7 +229,7 @@ def test_a_robot_that_its_owner_lost_is_searched_by_all():
     ],
 )
 def test_invalid_reports_are_refused(wrong: dict):
-    report = {"zone": "a", "t_ns": 0, "claims": {"r": Claim(1, "a", 0)}}
+    report = {"t_ns": 0, "claims": {"r": Claim(1, "a", 0)}}
     assert decode(encode(ZoneReport(**report)), ZoneReport) == ZoneReport(**report)
     with pytest.raises(MessageError):
         decode(encode(ZoneReport(**report | wrong)), ZoneReport)

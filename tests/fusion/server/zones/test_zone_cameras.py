@@ -5,29 +5,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.rig.camera import Camera
 from camera_node.geometry.pose import Pose, look_at
 from fusion.server.zones.zone_cameras import ZoneCameras
 from tests.fusion.synthetic import TRIANGLE
-
-STEP_M, HALF_M = 3.0, 2.0  # between two pairs of cameras, and from the hall's axis to its walls
-
-
-def hall(pairs: int) -> dict[str, Camera]:
-    """Pairs of cameras on both walls, which look down at the axis; one pair sees the places of the next, not more."""
-    lens = {"width": 800, "height": 600, "fx": 650.0, "fy": 651.0, "cx": 402.0, "cy": 297.0}
-    return {
-        f"{side}{k}": Camera(
-            **lens, T_world_cam=Pose.from_matrix(look_at([STEP_M * k, y, 3.0], [STEP_M * k, y / 4, 0.0]))
-        )
-        for k in range(pairs)
-        for side, y in (("n", HALF_M), ("s", -HALF_M))
-    }
-
-
-def pairs(*numbers: int) -> tuple[str, ...]:
-    return tuple(f"{side}{k}" for k in numbers for side in "ns")
-
+from tests.fusion.zone_hall import hall, pairs
 
 ZONES = {"west": pairs(0, 1), "middle": pairs(2, 3), "east": pairs(4, 5)}
 CAMERAS = ZoneCameras(hall(6), ZONES, TRIANGLE.diameter_m)
