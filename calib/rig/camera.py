@@ -36,6 +36,10 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
             the row at height h of the image (`image_row`) is captured h readout times later. None: as the camera says.
         covariance: (6, 6) of the pose in GTSAM's tangent order (rotation, then translation, both in the camera's
             frame), rad and m; None where unknown.
+        errors: (8, n) rows of a factor L of the covariance L L^T of the errors of all cameras of the rig, with the
+            cross terms: rotation and translation as in `covariance`, clock offset (s) and logarithm of the focal
+            length. They contain errors of the lens, as those that look alike (`calib.rig.camera_errors`). None where
+            unknown.
         lens_sigma: standard deviations of the lens's `parameters`, in their order; None where never measured.
     """
 
@@ -45,6 +49,7 @@ class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
     time_reference_ns: int = 0
     readout_us: float | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
+    errors: tuple[tuple[float, ...], ...] | None = None
     lens_sigma: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:

@@ -2,29 +2,100 @@
 """The errors of calibrated cameras, as users of a rig count them: covariances of all cameras together, and their size
 in the image."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import permutations
 
+import msgspec
 import numpy as np
 
-from calib.rig.camera import Camera, pixel_jacobians
+from calib.rig.camera import LENS, OFFSET, PER_CAMERA, POSE, Camera, pixel_jacobians
 from camera_node.foundation.arrays import Array
+from camera_node.geometry.lens import Lens
 
 # The errors of a camera, by their columns: rotation and translation in its own frame (rad, m), clock offset (s), and
 # logarithm of the focal length.
 ERRORS = 8
+PARAMETERS = (*POSE, *OFFSET, LENS[0])  # the same, as `calib.rig.camera` numbers them
+OF_IMAGE = np.arange(ERRORS) != 6  # all but the clock's displace the image of a point at rest
+MAX_JOINT = 16  # cameras whose covariances between each other fit into a rig's message: 16,384 numbers
+DIGITS = 6  # of a number in the file
+REGULAR = 1e-10  # of a correlation: a covariance of `DIGITS` digits may be singular
 # Error in the image of a rig that states no covariance: 0.01 to 0.06 px after a wand calibration with carefully
 # calibrated lenses (`python -m tests.benchmarks.calibration`).
 USUAL_PX = 0.05
 GRID = np.linspace(0.1, 0.9, 5)  # of the image, where its error is computed
 
 
-def error_covariance(cameras: Sequence[Camera]) -> Array:
-    """(8 C, 8 C) covariance of the errors of C placed cameras; `USUAL_PX` for those that state none."""
-    joint = np.zeros((len(cameras), ERRORS, len(cameras), ERRORS))
+def error_covariance(cameras: Sequence[Camera], unstated_px: float = USUAL_PX) -> Array:
+    """(8 C, 8 C) covariance of the errors of C placed cameras; `unstated_px` in the image for those that state none.
+
+    Rows of `Camera.errors` are of one factor where they are equally long. Other cameras are independent.
+    """
+    n, d = len(cameras), ERRORS * len(cameras)
+    joint = np.zeros((n, ERRORS, n, ERRORS))
+    rows = {k: np.array(camera.errors) for k, camera in enumerate(cameras) if camera.errors is not None}
+    width = max((row.shape[1] for row in rows.values()), default=0)
     for k, (camera, range_m) in enumerate(zip(cameras, working_ranges(cameras).tolist(), strict=True)):
-        pose = usual_covariance(camera, range_m) if camera.covariance is None else np.array(camera.covariance)
-        joint[k, :6, k, :6] = pose
-    return joint.reshape(ERRORS * len(cameras), -1)
+        if k in rows:
+            joint[k, :, k] = rows[k] @ rows[k].T
+        elif camera.covariance is not None:
+            joint[k, :6, k, :6] = np.array(camera.covariance)
+        else:
+            joint[k, :6, k, :6] = usual_covariance(camera, range_m, unstated_px)
+    together = [k for k, row in rows.items() if row.shape[1] == width > ERRORS]
+    for k, m in permutations(together, 2):
+        joint[k, :, m] = rows[k] @ rows[m].T
+    return joint.reshape(d, d)
+
+
+def with_errors(cameras: Mapping[str, Camera], covariance: Array) -> dict[str, Camera]:
+    """The cameras with their part of a joint covariance (8 C, 8 C), in their order; without the covariances between
+    them beyond `MAX_JOINT` cameras."""
+    n = len(cameras)
+    if n > MAX_JOINT:
+        full = np.array([_factor(block) for block in _own_blocks(covariance)]).reshape(n * ERRORS, ERRORS)
+    else:
+        full = _factor(covariance)
+    stated = {}
+    for k, (name, camera) in enumerate(cameras.items()):
+        rows = full[ERRORS * k : ERRORS * (k + 1)]
+        errors = tuple(tuple(float(f"{x:.{DIGITS}g}") for x in row) for row in rows.tolist())
+        stated[name] = msgspec.structs.replace(camera, errors=errors)
+    return stated
+
+
+def as_pose_errors(lens: Lens, points: Array, parameters: tuple[int, ...]) -> Array:
+    """(8, d) the errors that displace the images of points (N, 3), camera frame, most as errors of d `parameters`
+    (`calib.rig.camera`) do: least squares.
+
+    A principal point that is off looks like a turn, and what a wand does not tell apart does not matter where it was
+    waved. Poses and lenses apart would claim both.
+    """
+    found = np.zeros((ERRORS, len(parameters)))
+    _, _, J_pose, J_lens = pixel_jacobians(lens, points)
+    by_error = np.concatenate([J_pose, J_lens[:, :, :1]], axis=2)
+    by_parameter = np.zeros((len(points), 2, PER_CAMERA))
+    by_parameter[:, :, POSE], by_parameter[:, :, LENS] = J_pose, J_lens
+    known = np.isfinite(by_error).all(axis=(1, 2))
+    B, A = by_error[known].reshape(-1, 7), by_parameter[known][:, :, parameters].reshape(-1, len(parameters))
+    found[OF_IMAGE] = np.linalg.lstsq(B, A, rcond=None)[0]
+    for k, parameter in enumerate(parameters):
+        found[6, k] = float(parameter == OFFSET[0])
+    return found
+
+
+def _factor(covariance: Array) -> Array:
+    """(n, n) lower triangular L with L L^T the covariance (n, n), which may be singular."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny ** 0.5))
+    correlation = covariance / np.outer(scale, scale)
+    regular = correlation + REGULAR * np.eye(len(scale))
+    return scale[:, None] * np.asarray(np.linalg.cholesky(regular), float)
+
+
+def _own_blocks(covariance: Array) -> Array:
+    """(C, 8, 8) covariances of single cameras."""
+    n = len(covariance) // ERRORS
+    return np.einsum("kikj->kij", covariance.reshape(n, ERRORS, n, ERRORS))
 
 
 def usual_covariance(camera: Camera, range_m: float, error_px: float = USUAL_PX) -> Array:
@@ -40,9 +111,10 @@ def image_errors(cameras: Sequence[Camera], covariance: Array) -> Array:
         v, u = np.meshgrid(GRID * camera.height, GRID * camera.width, indexing="ij")
         rays = camera.rays(np.column_stack([u.ravel(), v.ravel()]))
         rays = rays[np.isfinite(rays).all(axis=1)]
-        J = pixel_jacobians(camera, range_m * rays)[2]
-        own = slice(ERRORS * k, ERRORS * k + 6)
-        squares = np.einsum("nai,ij,naj->n", J, covariance[own, own], J)
+        _, _, J_pose, J_lens = pixel_jacobians(camera, range_m * rays)
+        J = np.concatenate([J_pose, J_lens[:, :, :1]], axis=2)
+        own = np.flatnonzero(OF_IMAGE) + ERRORS * k
+        squares = np.einsum("nai,ij,naj->n", J, covariance[np.ix_(own, own)], J)
         found.append(np.sqrt(squares.mean() / 2) if len(squares) else 0.0)
     return np.array(found)
 

@@ -15,6 +15,7 @@ import msgspec
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
+from calib.rig.camera_errors import ERRORS, MAX_JOINT
 from calib.rig.file_history import History
 from camera_node.foundation.config import NAME_RULE, dump_yaml, is_name, load_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
@@ -33,6 +34,7 @@ QUATERNION_NORM = (1e-6, 1e6)
 MAX_TIME_OFFSET_MS = 86_400_000.0  # a day: recordings of one session
 MAX_TIME_DRIFT_PPM = 1e5  # three times the largest drift that a calibration estimates
 MAX_COVARIANCE = 1e12
+MAX_ERROR_COLUMNS = ERRORS * MAX_JOINT
 MAX_FIGURES, MAX_DEPTH, MAX_TEXT = 50_000, 8, 10_000  # of the `calibration` map: values, nesting, characters
 
 
@@ -200,6 +202,21 @@ def _find_fault_of_pose(camera: Camera) -> str:
             return f"the covariance must be finite and within {MAX_COVARIANCE:g}"
         if min(covariance[k][k] for k in range(6)) < 0:
             return "a variance is below 0"
+    return _find_fault_of_errors(camera.errors)
+
+
+def _find_fault_of_errors(errors: tuple[tuple[float, ...], ...] | None) -> str:
+    if errors is None:
+        return ""
+    width = len(errors[0]) if errors else 0
+    if (
+        len(errors) != ERRORS
+        or any(len(row) != width for row in errors)
+        or not 0 < width <= MAX_ERROR_COLUMNS
+    ):
+        return f"errors must have {ERRORS} equal rows of at most {MAX_ERROR_COLUMNS} numbers"
+    if not all(abs(x) <= MAX_COVARIANCE for row in errors for x in row):
+        return f"the numbers of errors must be finite and within {MAX_COVARIANCE:g}"
     return ""
 
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
 from calib.rig.camera import LENS, OFFSET, POSE, Camera, pixel_jacobians, transform
+from calib.rig.camera_errors import PARAMETERS, error_covariance
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
@@ -123,13 +124,9 @@ class JointCovariance:
     covariance: Array
 
     @classmethod
-    def of_poses(cls, cameras: Sequence[Camera]) -> "JointCovariance":
-        """The cameras' own pose covariances, independent of each other; 0 for a camera without one."""
-        joint = np.zeros((6 * len(cameras), 6 * len(cameras)))
-        for k, camera in enumerate(cameras):
-            if camera.covariance is not None:
-                joint[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = camera.covariance
-        return cls(POSE, joint)
+    def stated(cls, cameras: Sequence[Camera]) -> "JointCovariance":
+        """What the cameras state of their errors; 0 for a camera that states none."""
+        return cls(PARAMETERS, error_covariance(cameras, unstated_px=0.0))
 
 
 def in_image(camera: Camera, points: Array) -> Mask:
@@ -154,14 +151,14 @@ def point_covariances(
         cameras: C placed cameras; a camera without covariance counts as exact.
         points: (N, 3) world, metres.
         sigma_px: standard deviation of one pixel coordinate.
-        joint: covariance of all cameras together; by default independent poses and exact lenses.
+        joint: covariance of all cameras together; by default what they state.
         sees: the visibility test, which returns (N,) whether a camera sees each point.
 
     Returns:
         (N, 3, 3) square metres; infinite where fewer than two cameras see the point, or their rays are parallel.
     """
     points = np.asarray(points, float).reshape(-1, 3)
-    joint = joint or JointCovariance.of_poses(cameras)
+    joint = joint or JointCovariance.stated(cameras)
     seen = np.array([sees(camera, points) for camera in cameras], bool).reshape(len(cameras), len(points))
     known, inverse, by_camera = point_derivatives(cameras, points, sigma_px, joint.parameters, seen)
     covariance = np.full((len(points), 3, 3), np.inf)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT, Camera
+from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT, Camera, transform
+from calib.rig.camera_errors import ERRORS, as_pose_errors, with_errors
 from calib.rig.rig import Rig
 from calib.wand.alignment import Alignment, ClockMap
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance, parameter_sigma
@@ -29,7 +30,9 @@ from calib.wand.wand_report import (
 )
 from calib.world.world_frame import move_rig, upright_frame
 from camera_node.foundation.arrays import Array
-from camera_node.geometry.pose import Pose
+from camera_node.geometry.pose import Pose, invert
+
+MAX_POINTS = 500  # of the wand's path, for what its images do not tell apart
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +155,9 @@ def adjusted_camera(
     if READOUT[0] in adjusted.problem.free:
         readout_us = 1e6 * float(adjusted.problem.readout_s[k] + state.clocks[k, 2])
     lens_sigma = np.sqrt(np.diag(covariance.of(LENS)[k, :, k]))
+    by_parameter = _pose_errors(adjusted, k, covariance.free)
+    own = by_parameter @ covariance.joint[k, :, k] @ by_parameter.T
+    camera = with_errors({"": camera}, own)[""]
     return msgspec.structs.replace(
         camera.with_parameters(lens.parameters),
         T_world_cam=Pose.from_matrix(state.cameras[k]),
@@ -162,15 +168,30 @@ def adjusted_camera(
     )
 
 
+def _pose_errors(adjusted: Adjusted, k: int, free: tuple[int, ...]) -> Array:
+    """(8, d) the errors of camera k that look like errors of its d free parameters, where the wand was."""
+    state, count = adjusted.state, len(adjusted.state.motion)
+    T, knots = state.cameras[k], np.linspace(0, count - 1, min(count, MAX_POINTS)).astype(int)
+    points = transform(invert(T), state.motion[knots, 0].reshape(-1, 3))
+    lens = state.lens(k, adjusted.problem.lenses[k])
+    uv = lens.project(points)
+    seen = points[((uv > 0) & (uv < [lens.width, lens.height])).all(axis=1)]
+    return as_pose_errors(lens, seen, free)
+
+
 def _place(
     rig: Rig, adjusted: Adjusted, covariance: CameraCovariance, placement: Placement, offset_ms: Array
 ) -> Rig:
     cameras = dict(rig.cameras)
     for name in placement.unplaced:
-        cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None)
+        cameras[name] = msgspec.structs.replace(cameras[name], T_world_cam=None, covariance=None, errors=None)
     for k, name in enumerate(placement.recording.names):
         cameras[name] = adjusted_camera(cameras[name], adjusted, covariance, k, float(offset_ms[k]))
-    state = adjusted.state
+    state, free = adjusted.state, covariance.free
+    by_parameter = [_pose_errors(adjusted, k, free) for k in range(len(placement.recording.names))]
+    joint = np.einsum("aip,apbq,bjq->aibj", by_parameter, covariance.joint, by_parameter)
+    placed = {name: cameras[name] for name in placement.recording.names}
+    cameras |= with_errors(placed, joint.reshape(ERRORS * len(placed), -1))
     T_world = upright_frame(state.cameras, state.motion[:, 0].reshape(-1, 3))
     return move_rig(msgspec.structs.replace(rig, cameras=cameras), T_world)
 

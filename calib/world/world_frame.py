@@ -67,6 +67,9 @@ def scale_rig(rig: Rig, scale: float) -> Rig:
         if camera.covariance is not None:
             cov = np.array(camera.covariance) * np.outer(factors, factors)
             camera = msgspec.structs.replace(camera, covariance=tuple(map(tuple, cov.tolist())))
+        if camera.errors is not None:
+            rows = [[(scale if 3 <= k < 6 else 1.0) * x for x in row] for k, row in enumerate(camera.errors)]
+            camera = msgspec.structs.replace(camera, errors=tuple(map(tuple, rows)))
         cameras[name] = camera
     return msgspec.structs.replace(rig, cameras=cameras)
 

@@ -285,7 +285,7 @@ class Verifier:
             return None
         rows = np.unique(np.linspace(0, len(sightings) - 1, MAX_DERIVATIVES).round().astype(int))
         weight = share[rows] / share[rows].sum()
-        joint = JointCovariance.of_poses(cameras)
+        joint = JointCovariance.stated(cameras)
         points = np.concatenate([sightings[k].position for k in rows])
         seen = np.concatenate([sightings[k].cameras for k in rows]).T
         known, _, by_camera = point_derivatives(cameras, points, SIGMA_PX, joint.parameters, seen)

@@ -2,7 +2,8 @@
 """The server's corrections of moved cameras, as recorded in the `calibration` map of a rig: both the server and its
 clients read them."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -21,17 +22,32 @@ class ExtrinsicsCorrection:
         name: of the camera.
         camera: with the pose with which it is used again; None when it is excluded.
         has_returned: whether that pose is the one in use, or one before.
+        rig: all cameras in use with their errors (`Camera.errors`) from now on; empty where these stay.
     """
 
     name: str
     camera: Camera | None
     has_returned: bool = False
+    rig: Mapping[str, Camera] = field(default_factory=dict)
 
 
-def correct(rig: Rig, name: str, camera: Camera, t_ns: int) -> Rig:
+def correct(rig: Rig, correction: ExtrinsicsCorrection, t_ns: int) -> Rig:
     """The rig with a camera that the server recalibrated at `t_ns`."""
-    calibration = rig.calibration | {CORRECTED: {"camera": name, "t_ns": t_ns}}
-    return msgspec.structs.replace(rig, cameras={**rig.cameras, name: camera}, calibration=calibration)
+    calibration = rig.calibration | {CORRECTED: {"camera": correction.name, "t_ns": t_ns}}
+    cameras = with_errors_of(rig.cameras, correction.rig)
+    if correction.camera is not None:
+        cameras[correction.name] = correction.camera
+    return msgspec.structs.replace(rig, cameras=cameras, calibration=calibration)
+
+
+def with_errors_of(cameras: Mapping[str, Camera], others: Mapping[str, Camera]) -> dict[str, Camera]:
+    """The cameras with the errors (`Camera.errors`) of those of the same names."""
+    changed = {
+        name: msgspec.structs.replace(camera, errors=others[name].errors)
+        for name, camera in cameras.items()
+        if name in others
+    }
+    return {**cameras, **changed}
 
 
 def corrected_camera(undone: Rig, restored: Rig) -> str | None:

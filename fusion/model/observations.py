@@ -6,6 +6,7 @@ the undistorted image plane x/z, y/z; `CalibratedFrame.measure` undistorts each 
 columns: (3, N) for N vectors.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -19,6 +20,7 @@ from camera_node.foundation.columns import Columns
 from camera_node.geometry.outline import half_axes_of
 from fusion import _core
 from fusion._core import SLACK_PX
+from fusion.model.corrections import with_errors_of
 from fusion.model.frames import FrameSet
 from fusion.model.robots import Robot
 from fusion.model.states import States
@@ -132,6 +134,13 @@ class CameraArray:
         self._cameras[name] = camera
         self.revision += 1
         self._update()
+
+    def state_errors(self, cameras: Mapping[str, Camera]) -> None:
+        """Take the errors (`Camera.errors`) that a rig of the same cameras states."""
+        if cameras:
+            self._cameras = with_errors_of(self._cameras, cameras)
+            self.revision += 1
+            self._update()
 
     def _update(self) -> None:
         cameras = self._cameras.values()

@@ -82,6 +82,7 @@ class CameraMonitors:
         for correction in corrections:
             if correction.camera is not None:
                 self._cameras.place(correction.name, correction.camera)
+                self._cameras.state_errors(correction.rig)
                 self.consistency.forget(correction.name)
                 self.clocks.rebase()
         return corrections

@@ -18,15 +18,14 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2
 
+from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
 from fusion.model.observations import MatchedObservations
 from fusion.model.states import OMEGA, VELOCITY, States
 
-# The errors of a camera by their columns: rotation and translation in its own frame (rad, m), clock offset (s), and
-# logarithm of the focal length.
-ERRORS = 8
+# The errors of a camera by their columns (`calib.rig.camera_errors`).
 CAUSES: dict["Cause", slice] = {"pose": slice(0, 6), "clock": slice(6, 7), "focal": slice(7, 8)}
 Cause = Literal["pose", "clock", "focal"]
 # Standard deviations of errors that a hypothesis frees: weak, they only keep the system regular.
@@ -48,7 +47,7 @@ class Window:
     Attributes:
         names: (C,) of the cameras.
         T: (C, 4, 4) their calibrated poses T_world_cam.
-        prior: (C, 8, 8) information about the errors of each camera.
+        prior: (8 C, 8 C) covariance of the errors of the cameras.
         states: B bodies, with velocities that do not depend on single frames.
         velocity_sigma: (B, 2) of these: angular and linear, rad/s and m/s.
         single: (B,) bodies with one marker.
@@ -168,8 +167,33 @@ class Fit:
     def covariance(self, camera: int) -> Array:
         """(8, 8) of the errors of a camera."""
         rows = slice(ERRORS * camera, ERRORS * (camera + 1))
-        information = self.reduced[:, :-1] + self.prior
-        return self.variance * np.asarray(np.linalg.inv(information), float)[rows, rows]
+        return self.variance * self._posterior()[rows, rows]
+
+    def _posterior(self) -> Array:
+        """(8 C, 8 C) covariance of the errors, with residuals of unit variance."""
+        return np.asarray(np.linalg.inv(self.reduced[:, :-1] + self.prior), float)
+
+    def joint_covariance(self, before: Array, camera: int) -> Array:
+        """(8 C, 8 C) of the errors once the pose of one camera is that of this fit, and the others are as they were.
+
+        The error of the new pose is that of the fit, so it is correlated with those of the other cameras as in the
+        fit; these keep their own covariance.
+
+        Args:
+            before: (8 C, 8 C) that of the calibration.
+            camera: whose pose is free in this fit.
+        """
+        fitted, joint = self._posterior(), before.copy()
+        pose = ERRORS * camera + np.arange(CAUSES["pose"].stop)
+        others = np.setdiff1d(np.flatnonzero(np.arange(len(joint)) % ERRORS < CAUSES["pose"].stop), pose)
+        own, cross = self.variance * fitted[np.ix_(pose, pose)], fitted[np.ix_(pose, others)]
+        shared = cross @ np.linalg.pinv(before[np.ix_(others, others)], hermitian=True) @ cross.T
+        if np.linalg.eigvalsh(own - shared)[0] < 0:  # the fit's prior is wider than the calibration
+            own = own + shared
+        joint[pose], joint[:, pose] = 0.0, 0.0
+        joint[np.ix_(pose, pose)] = own
+        joint[np.ix_(pose, others)], joint[np.ix_(others, pose)] = cross, cross.T
+        return joint
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,11 +277,12 @@ def _suspects(poses: Sequence[Fit]) -> list[int]:
 
 def fit(window: Window, hypothesis: Hypothesis) -> Fit:
     """Fit cameras and robots from the start of the hypothesis, by Levenberg-Marquardt with Cauchy weights."""
-    at = _evaluate(window, hypothesis, hypothesis.start, np.zeros((len(window.states), 12)))
+    prior = _prior(window, hypothesis.free)
+    at = _evaluate(window, hypothesis, prior, hypothesis.start, np.zeros((len(window.states), 12)))
     damping = FIRST_DAMPING
     for _ in range(MAX_ITERATIONS):
         by_camera, by_body = _step(window, hypothesis, at, damping)
-        tried = _evaluate(window, hypothesis, at.errors + by_camera, at.bodies + by_body)
+        tried = _evaluate(window, hypothesis, prior, at.errors + by_camera, at.bodies + by_body)
         if tried.cost >= at.cost:
             damping *= 10
             continue
@@ -271,12 +296,9 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
 
 def _prior(window: Window, free: Mask) -> Array:
     """(8 C, 8 C) information about the errors, without that about the free ones."""
-    n = len(window.names)
-    full = np.zeros((n, ERRORS, n, ERRORS))
-    for k in range(n):
-        held = ~free[k]
-        full[k, :, k] = window.prior[k] * np.outer(held, held) + np.diag(free[k] / FREE_SIGMA**2)
-    return full.reshape(n * ERRORS, n * ERRORS)
+    held = ~free.ravel()
+    covariance = window.prior * np.outer(held, held) + np.diag((free * FREE_SIGMA**2).ravel())
+    return np.asarray(np.linalg.inv(covariance), float)
 
 
 def _body_prior(window: Window) -> Array:
@@ -307,8 +329,8 @@ class _Point:
     cost: float
 
 
-def _evaluate(window: Window, hypothesis: Hypothesis, errors: Array, bodies: Array) -> _Point:
-    """Linearize at a point."""
+def _evaluate(window: Window, hypothesis: Hypothesis, prior: Array, errors: Array, bodies: Array) -> _Point:
+    """Linearize at a point; `prior` (8 C, 8 C) is the information of the hypothesis."""
     states, seen = window.states.retract(bodies), window.observations.detections
     T, camera = retract(window.T, errors), seen.exposures.camera
     R, centres = T[camera, :3, :3].transpose(0, 2, 1), T[camera, :3, 3]
@@ -324,7 +346,7 @@ def _evaluate(window: Window, hypothesis: Hypothesis, errors: Array, bodies: Arr
     r = by_body[:, :, 12] - by_camera[:, :, 7] * errors[window.camera, 7, None]
     squared = np.where(visible, np.sum(r**2, 1), np.nan)
     capped = np.nan_to_num(squared, nan=BEHIND)
-    prior, held = _prior(window, hypothesis.free), np.where(hypothesis.free, 0.0, errors).ravel()
+    held = np.where(hypothesis.free, 0.0, errors).ravel()
     cost = _core.CAUCHY**2 * np.log1p(capped / _core.CAUCHY**2).sum()
     cost += held @ prior @ held + np.sum(bodies**2 * _body_prior(window))
     rows = np.concatenate([by_body[:, :, :12], by_camera, r[:, :, None]], 2)

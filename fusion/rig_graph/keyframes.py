@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from calib.rig.camera import FOCAL_STABILITY, Camera, pixel_jacobians
+from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_rotation
 from fusion.model.expected_views import ExpectedViews
@@ -27,7 +28,7 @@ from fusion.model.observations import (
     MatchedObservations,
 )
 from fusion.model.states import Snapshot, States
-from fusion.rig_graph.hypotheses import ERRORS, Window
+from fusion.rig_graph.hypotheses import FREE_SIGMA, Window
 
 SEARCH_PX = 120.0  # largest image shift: 8 degrees at a focal length of 840 px
 BIN_PX = 6.0
@@ -40,6 +41,7 @@ GATES_PX = (16.0, 10.0, 8.0, 8.0)
 FOUND = 0.8  # of the expected markers within the last gate: detections need no other assignment
 ITERATIONS = 5
 MIN_SEEN = 4  # detections of a robot in a keyframe: 8 equations of its pose, 6
+NEGLIGIBLE = 1e-6  # share of free errors, that keeps covariances of exact cameras regular
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock offset, beside what the stamps claim
 
 
@@ -307,14 +309,12 @@ def _are_determined(robot: Index, camera: Index) -> Mask:
 
 
 def _prior(cameras: CameraArray, exposures: Exposures) -> Array:
-    """(C, 8, 8) information about the errors of the calibrated cameras."""
-    found = np.zeros((len(cameras.names), ERRORS, ERRORS))
+    """(8 C, 8 C) covariance of the errors of the calibrated cameras, with what clocks and lenses change since then."""
+    covariance = cameras.covariance + np.diag(np.tile(FREE_SIGMA * NEGLIGIBLE, len(cameras.names)) ** 2)
     for k, name in enumerate(cameras.names):
-        camera, own = cameras[name], slice(ERRORS * k, ERRORS * (k + 1))
-        covariance = cameras.covariance[own, own].copy()
+        camera, first = cameras[name], ERRORS * k
         stamps_s = exposures.tau_sigma[exposures.camera == k].max(initial=0.0)
-        covariance[6, 6] = OFFSET_SIGMA_S**2 + stamps_s**2
+        covariance[first + 6, first + 6] += OFFSET_SIGMA_S**2 + stamps_s**2
         focal = camera.lens_sigma[0] / camera.fx if camera.lens_sigma is not None else FOCAL_STABILITY
-        covariance[7, 7] += focal**2
-        found[k] = np.linalg.inv(covariance)
-    return found
+        covariance[first + 7, first + 7] += focal**2
+    return covariance

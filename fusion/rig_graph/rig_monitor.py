@@ -26,6 +26,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from calib.rig.camera import Camera
+from calib.rig.camera_errors import ERRORS, with_errors
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose
 from fusion.model.corrections import ExtrinsicsCorrection
@@ -34,7 +35,6 @@ from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import Snapshot
 from fusion.protocol.pose_messages import Contradiction
 from fusion.rig_graph.hypotheses import (
-    ERRORS,
     FALSE_ALARM,
     Fit,
     Hypothesis,
@@ -270,7 +270,9 @@ class RigMonitor:
         pose = Pose.from_matrix(retract(window.T, best.errors)[k])
         stated = tuple(map(tuple, covariance.tolist()))
         camera = msgspec.structs.replace(self._cameras[name], T_world_cam=pose, covariance=stated)
-        return ExtrinsicsCorrection(name, camera)
+        joint = best.joint_covariance(self._cameras.covariance, k)
+        rig = with_errors(self._cameras.as_dict() | {name: camera}, joint)
+        return ExtrinsicsCorrection(name, rig[name], rig=rig)
 
     def _remember(self, name: str, camera: Camera) -> None:
         known = self._known.setdefault(name, [])

@@ -13,7 +13,7 @@ from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
-from fusion.model.corrections import ExtrinsicsCorrection, corrected_camera
+from fusion.model.corrections import ExtrinsicsCorrection, corrected_camera, with_errors_of
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import Robots, RobotsRequest
@@ -123,7 +123,7 @@ class TrackingPipeline:
     def correct_rig(self, correction: ExtrinsicsCorrection, now_ns: int) -> None:
         """Update the active rig by a camera with another pose."""
         if correction.camera is not None and correction.camera != self.cameras.get(correction.name):
-            self.active_rig.correct(correction.name, correction.camera, now_ns)
+            self.active_rig.correct(correction, now_ns)
 
     def _use(self, rig: Rig, save: Callable[[], object], pinned: str | None = None) -> None:
         """Track with another rig, then save it; on a fault of either, track with the old one again.
@@ -135,7 +135,8 @@ class TrackingPipeline:
         """
         old, synchronizer, tracker = self.cameras, self.synchronizer, self.tracker
         placed = rig.placed()
-        changed = [name for name in placed if placed[name] != old.get(name)]
+        stated = with_errors_of(old, placed)
+        changed = [name for name in placed if placed[name] != stated.get(name)]
         in_place = tracker is not None and placed.keys() == old.keys() and len(changed) <= 1
         try:
             if not in_place:
@@ -144,12 +145,14 @@ class TrackingPipeline:
             elif tracker is not None:
                 for name in changed:
                     tracker.place(name, placed[name], pinned=name == pinned)
+                tracker.cameras.state_errors(placed)
             save()
         except Exception as error:  # nothing that a rig contains may end the server
             self.tracker, self.synchronizer = tracker, synchronizer
             if in_place and tracker is not None:
                 for name in changed:
                     tracker.place(name, old[name])
+                tracker.cameras.state_errors(old)
             if isinstance(error, RoundelError):
                 raise
             log.exception("a rig can't be used")

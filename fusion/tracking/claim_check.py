@@ -5,8 +5,8 @@ The squared residuals of a robot's detections in a frame set, in claimed standar
 their number less what the estimate absorbs (redundancy, Baarda 1968). Sums over some seconds are compared. A camera is
 named if all residuals fit once it is left out, and not once any other is; a robot if the others of its cameras fit.
 
-The errors of the rig are the same in all frame sets, so they do not average: for cameras with a covariance they enlarge
-the expectation, and have the degrees of freedom of one pose (Satterthwaite 1946).
+The errors of the rig are the same in all frame sets, so they do not average: their part of the expectation has the
+degrees of freedom of one pose (Satterthwaite 1946).
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,6 @@ from typing import Literal
 import numpy as np
 from scipy import stats
 
-from calib.rig.triangulation import camera_jacobians
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
 from fusion.model.observations import (
@@ -43,8 +42,8 @@ class _Sums:
 
     Attributes:
         squares: of residuals in claimed standard deviations.
-        redundancy: what noise makes of them.
-        rig: what the rig's covariance makes of them.
+        redundancy: what noise and the rig's errors make of them.
+        rig: the part by the rig's errors.
         squares_m2: of the errors of detections at the distance of their markers, square metres.
         count: of detections.
     """
@@ -67,13 +66,13 @@ class _Sums:
 
     def ratio(self) -> Array:
         """Squared errors over their claims; 0 where nothing could contradict."""
-        expected = self.redundancy + self.rig
-        return np.divide(self.squares, expected, out=np.zeros_like(expected), where=self.redundancy > 0)
+        expected = self.redundancy
+        return np.divide(self.squares, expected, out=np.zeros_like(expected), where=expected > 0)
 
     def contradicts(self) -> Mask:
         """Where the squared errors exceed their claims significantly."""
-        expected = np.maximum(self.redundancy + self.rig, 1e-9)
-        degrees = expected**2 / np.maximum(self.redundancy + self.rig**2 / POSE_DEGREES, 1e-9)
+        expected = np.maximum(self.redundancy, 1e-9)
+        degrees = expected**2 / (expected - self.rig + self.rig**2 / POSE_DEGREES)
         bound = stats.chi2.isf(FALSE_ALARM, np.maximum(degrees, 1e-3)) / np.maximum(degrees, 1e-3)
         return (self.redundancy > MIN_REDUNDANCY) & (self.ratio() > np.maximum(CLAIM_RATIO, bound))
 
@@ -188,19 +187,13 @@ class ClaimCheck:
         )
 
     def _sizes(self, states: States, observations: MatchedObservations) -> tuple[Array, Array]:
-        """One claimed standard deviation of N detections at the distance of their markers, metres (N,), and what the
-        rig's covariance adds to the squares of their residuals (N,)."""
+        """One claimed standard deviation of N detections at the distance of their markers, metres (N,), and the part
+        of their variances that is the rig's (N,)."""
         cameras, seen = self._estimator.cameras, observations.detections
         centre = cameras.views(states, seen.exposures, observations.discs).centre
         weight = np.abs(_determinant(observations.whiten))  # of squares in the image plane
-        rig = np.zeros(len(seen))
-        for k, name in enumerate(cameras.names):
-            camera, mine = cameras[name], np.flatnonzero(seen.camera == k)
-            if camera.covariance is not None and len(mine):
-                J = camera_jacobians(camera, centre[:, mine].T)
-                of_pixel = weight[mine] / np.abs(_determinant(seen.scale[:, :, mine]))
-                rig[mine] = np.einsum("nij,jk,nik->n", J, np.array(camera.covariance), J) * of_pixel
-        return centre[2] / np.sqrt(weight), np.nan_to_num(rig)
+        rig_px2 = cameras.error_px[seen.camera] ** 2
+        return centre[2] / np.sqrt(weight), 2 * rig_px2 / (seen.cov[0, 0] + seen.cov[1, 1])
 
 
 def _determinant(matrices: Array) -> Array:
@@ -236,7 +229,7 @@ class _Equations:
         sample = (
             float(squares[used].sum()),
             redundancy,
-            float(self.rig[used].sum()),
+            redundancy * float(self.rig[used].mean()) if used.any() else 0.0,
             float(squares_m2[used].sum()),
         )
         return (*sample, float(used.sum())), float(squares_m2[~used].sum())

@@ -13,7 +13,6 @@ from typing import Literal
 
 import msgspec
 
-from calib.rig.camera import Camera
 from calib.rig.file_history import History
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from calib.rig.rig_messages import (
@@ -33,7 +32,7 @@ from calib.rig.rig_messages import (
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError, RoundelError
 from camera_node.protocol.requests import RequestSource
-from fusion.model.corrections import correct, is_corrected
+from fusion.model.corrections import ExtrinsicsCorrection, correct, is_corrected
 
 log = logging.getLogger("fusion")
 State = Literal["earlier", "in force", "undone"]
@@ -144,10 +143,10 @@ class ActiveRig:
         files = [*self._history.older()[-1:], *self._history.undone()[-1:], self._history.path]
         return self.rig is None or any(holds_rig(path, self.rig) for path in files)
 
-    def correct(self, name: str, camera: Camera, now_ns: int) -> None:
+    def correct(self, correction: ExtrinsicsCorrection, now_ns: int) -> None:
         """Use a new pose of a camera that was moved. A fault of the disk is only logged."""
         assert self.rig is not None
-        rig = correct(self.rig, name, camera, now_ns)
+        rig = correct(self.rig, correction, now_ns)
         saved = None
         try:
             self.save(rig, now_ns, is_correction=True)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from calib.rig.camera import Camera
-from calib.rig.camera_errors import ERRORS, error_covariance
+from calib.rig.camera_errors import ERRORS, error_covariance, with_errors
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray
@@ -31,10 +31,13 @@ def drawn(cameras: dict[str, Camera], rng: np.random.Generator) -> dict[str, Cam
     return true
 
 
-def stated(cameras: dict[str, Camera], turn_rad: float, shift_m: float) -> dict[str, Camera]:
-    """Cameras that state these standard deviations of their poses."""
-    covariance = tuple(map(tuple, np.diag(np.repeat([turn_rad, shift_m], 3) ** 2).tolist()))
-    return {n: msgspec.structs.replace(c, covariance=covariance) for n, c in cameras.items()}
+def stated(cameras: dict[str, Camera], rng: np.random.Generator) -> dict[str, Camera]:
+    """Cameras that state a covariance of all, with cross terms as large as their own: errors of as many millimetres and
+    tenths of a milliradian as a wand leaves, of three kinds each of which all cameras have, and of their own."""
+    scale = np.array([2e-4] * 3 + [1e-3] * 3 + [0.0] * 2)
+    kinds = rng.standard_normal((len(cameras), ERRORS, 3)) * scale[:, None] / 3**0.5
+    L = np.concatenate([kinds.reshape(-1, 3), np.diag(np.tile(scale, len(cameras))) / 2], axis=1)
+    return with_errors(cameras, L @ L.T)
 
 
 def squared_error(load: Load, cameras: dict[str, Camera], rng: np.random.Generator) -> float:
@@ -64,7 +67,7 @@ def test_the_errors_of_the_rig_are_claimed(markers: int, sigma_px: float, states
     squares = []
     for seed in range(RIGS):
         load = Load(1, markers, 4, HZ, 0.5, 0.1, 0.0, sigma_px=sigma_px, crossing=True, seed=seed)
-        cameras = stated(load.rig, 2e-4, 1e-3) if states_errors else load.rig
+        cameras = stated(load.rig, rng) if states_errors else load.rig
         squares.append(squared_error(load, cameras, rng))
     low, high = chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 3 * RIGS)
     assert low < np.sum(squares) < high, np.mean(squares) / 3

@@ -25,6 +25,7 @@ from camera_node.protocol.server_connection import Connection
 from camera_node.protocol.session import open_router
 from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
+from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
 from tests.fusion.serving import ARENA, config, connected, send_until_tracked, serving, zones_of
@@ -138,7 +139,9 @@ def test_undo_of_a_correction_restores_the_camera_and_no_longer_monitors_it(tmp_
     with serving(saving(tmp_path)) as (server, client):
         with pytest.raises(RequestError, match="no earlier version"):
             client.undo_rig()
-        server.transport.enqueue(lambda: server.pipeline.active_rig.correct("cam1", MOVED, 1))
+        server.transport.enqueue(
+            lambda: server.pipeline.active_rig.correct(ExtrinsicsCorrection("cam1", MOVED), 1)
+        )
         wait_for(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == MOVED)
         where = ("--connect", server.endpoints[0], "--arena", "test")
         done = run_program("fusion", "undo", *where)
@@ -253,7 +256,7 @@ def test_corrections_of_moved_cameras_displace_no_calibration(tmp_path: Path):
     moved = []
     for k in range(2 * MAX_OLD):
         pose = Pose((0.0, 0.0, float(k)), (1.0, 0.0, 0.0, 0.0))
-        active.correct("cam1", msgspec.structs.replace(MOVED, T_world_cam=pose), k)
+        active.correct(ExtrinsicsCorrection("cam1", msgspec.structs.replace(MOVED, T_world_cam=pose)), k)
         assert active.rig is not None
         moved.append(dump_rig(active.rig))
     states = [load_rig(path) for path in History(tmp_path / "rig.saved.yaml").older()]
