@@ -12,8 +12,8 @@ without standard deviations may come from a data sheet or from a careful calibra
 and so estimates how far off they are (empirical Bayes: Efron and Morris 1973): the deviation that lenses share, by kind
 of parameter, has a marginal likelihood. In the estimate, its prior is a mixture (spike and slab; Mitchell and Beauchamp
 1988): exact with probability 1/2, else of any order of magnitude, so exact lenses lose no accuracy. For the covariance,
-its prior is uniform between zero and the usual deviation (Gelman 2006), so errors that the recording cannot show count
-in full. docs/design/wand_adjustment.md has the equations.
+its prior is flat up to about the usual deviation, with a tail beyond (Student's distribution; Gelman 2006), so errors
+that the recording cannot show count in full. docs/design/wand_adjustment.md has the equations.
 """
 
 from collections.abc import Mapping
@@ -40,10 +40,13 @@ UNKNOWN_FOCAL = np.log(2) / np.sqrt(3)
 WIDER = np.array([15.0, 4.0, 4.0, 5.0, 4.0, 4.0, 2.0, 2.0, 4.0])
 CONTRADICTED = 1e-4  # probability below which the recording contradicts standard deviations of a lens
 UNCOMMON = 0.1  # part of the errors of fx and fy that is not common to both
-# Deviations that lenses may share, as shares of the usual ones, and their prior probabilities: for the estimate and for
-# the covariance.
-SHARES = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 31)])
-SPIKE_AND_SLAB, UNIFORM = np.where(SHARES > 0, 0.5 / (len(SHARES) - 1), 0.5), SHARES / SHARES.sum()
+# Deviations that lenses may share, as shares of the usual ones up to those of another lens, and their prior
+# probabilities: for the estimate, and for the covariance Student's distribution with three degrees of freedom and the
+# variance of shares that are uniform up to the usual deviation.
+SHARES = np.concatenate([[0.0], np.geomspace(1e-3, WIDER.max(), 43)])
+SPIKE_AND_SLAB = np.where(SHARES > 0, 0.5 / (len(SHARES) - 1), 0.5)
+STUDENT = SHARES * (1 + 3 * SHARES**2) ** -2
+STUDENT = STUDENT / STUDENT.sum()
 MIN_SHARE = 1e-5  # of the usual deviations: practically exact
 # Of the parameters: focal length, principal point, k1 and k2, ratio, p1 and p2, k3 (of a fisheye: k3 and k4, none).
 KINDS = np.array([0, 1, 1, 2, 3, 2, 4, 4, 5])
@@ -224,8 +227,8 @@ def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:
     sigma, unknown = _choose_sigma(adjusted.problem, information, gradient)
     prior, wider = problem.lens_sigma.copy(), problem.lens_sigma.copy()
     prior[estimated] = sigma * estimate_shares(information, gradient, sigma, unknown, SPIKE_AND_SLAB)
-    uniform = sigma * estimate_shares(information, gradient, sigma, unknown, UNIFORM)
-    wider[estimated] = np.maximum(uniform, prior[estimated])
+    heavy = sigma * estimate_shares(information, gradient, sigma, unknown, STUDENT)
+    wider[estimated] = np.maximum(heavy, prior[estimated])
     return replace(problem, lens_sigma=prior, covariance_lens_sigma=wider)
 
 
@@ -244,19 +247,19 @@ def _lens_likelihood(adjusted: Adjusted) -> tuple[Array, Array]:
 def lens_evidence(adjusted: Adjusted, instead: Array) -> float:
     """Logarithm of the Bayes factor of other lenses, as corrections (C, 9) of the given ones, over the given ones.
 
-    In either case the true lenses are off by a share of the usual standard deviations that they have in common, uniform
-    between none and all, so that two sets of lenses are distinguished as far as the recording determines the lenses. No
-    recording is taken to be better than its detections claim: without noise, rounding would decide.
+    In either case the true lenses are off by a share of the usual standard deviations, or of larger ones of their
+    files, that they have in common, so that two sets of lenses are distinguished as far as the recording determines
+    the lenses. No recording is taken to be better than its detections claim: without noise, rounding would decide.
     """
     claimed = min(1.0, adjusted.scale**2 * adjusted.inflation)
     information, gradient = (claimed * part for part in _lens_likelihood(adjusted))
     estimated = list(adjusted.problem.estimated_cameras())
     off = instead[estimated].ravel()
-    sigma = np.array([usual_sigma(adjusted.problem.lenses[k]) for k in estimated]).ravel()
+    sigma = np.array([coarse_sigma(adjusted.problem.lenses[k]) for k in estimated]).ravel()
 
     def evidence(off: Array) -> float:
         likelihood = _log_marginals(information, gradient - information @ off, SHARES[:, None] * sigma)
-        return float(np.logaddexp.reduce(likelihood[1:] + np.log(UNIFORM[1:])))
+        return float(np.logaddexp.reduce(likelihood[1:] + np.log(STUDENT[1:])))
 
     return evidence(off) - evidence(0 * off) + float(off @ gradient - off @ information @ off / 2)
 

@@ -13,7 +13,8 @@ from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import (
     KINDS,
     SHARES,
-    UNIFORM,
+    SPIKE_AND_SLAB,
+    STUDENT,
     calibrated_sigma,
     estimate_shares,
     usual_sigma,
@@ -120,23 +121,37 @@ def test_the_covariance_of_one_recalibrated_camera_with_an_inaccurate_lens_is_ri
 
 
 def test_claimed_deviations_are_those_of_the_lenses():
-    """With n lens errors of a kind that the recording shows exactly, of the sum Q of squares, the uniform prior of the
-    share claims the variance Q / (n - 3), less the part of its tail beyond the usual deviation, about Q^1/2 of it. A
-    recording that shows nothing claims the prior's own variance."""
+    """With n lens errors of a kind that the recording shows exactly, of the sum Q of squares, a flat prior of the
+    share claims the variance Q / (n - 3), less the part of the posterior beyond the bend of the prior at 1/sqrt(3),
+    about (3 Q)^1/2 of it. A recording that shows nothing claims the prior's own variance."""
     lens, lenses = recorded(1).truth.cameras["cam00"], 4
     sigma = np.tile(usual_sigma(lens), (lenses, 1))
     unknown, information = np.ones(sigma.shape, bool), np.diag(1e10 / sigma.ravel() ** 2)
     off = 0.01 * np.random.default_rng(0).standard_normal(sigma.shape)
     gradient = information @ (off * sigma).ravel()
-    shares = estimate_shares(information, gradient, sigma, unknown, UNIFORM)
+    shares = estimate_shares(information, gradient, sigma, unknown, STUDENT)
     for kind in np.unique(KINDS):
         squares = off[:, kind == KINDS] ** 2
         expected = squares.sum() / (squares.size - 3)
         assert shares[:, kind == KINDS] ** 2 == pytest.approx(
-            np.full(squares.shape, expected), rel=3 * squares.sum() ** 0.5
+            np.full(squares.shape, expected), rel=3 * (3 * squares.sum()) ** 0.5
         )
-    nothing = estimate_shares(0 * information, 0 * gradient, sigma, unknown, UNIFORM)
-    assert nothing**2 == pytest.approx(np.full(sigma.shape, UNIFORM @ SHARES**2))
+    nothing = estimate_shares(0 * information, 0 * gradient, sigma, unknown, STUDENT)
+    assert nothing**2 == pytest.approx(np.full(sigma.shape, STUDENT @ SHARES**2))
+
+
+def test_lenses_that_are_farther_off_than_usual_have_wider_priors():
+    """Four lenses, exactly shown, five times as far off as usual: either prior finds the root mean square, to the
+    standard error of four."""
+    lens = recorded(1).truth.cameras["cam00"]
+    sigma = np.tile(usual_sigma(lens), (4, 1))
+    off = 5 * np.random.default_rng(0).choice([-1.0, 1.0], sigma.shape)
+    information = np.diag(1e10 / sigma.ravel() ** 2)
+    for prior in (SPIKE_AND_SLAB, STUDENT):
+        shares = estimate_shares(
+            information, information @ (off * sigma).ravel(), sigma, np.ones(sigma.shape, bool), prior
+        )
+        assert np.allclose(shares, 5, rtol=0.5)
 
 
 def test_standard_deviations_of_a_lens_are_read_and_checked():
