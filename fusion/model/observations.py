@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
 from calib.rig.camera_errors import error_covariance, image_errors
-from camera_node.foundation.arrays import Array, Index
+from camera_node.detection.roundels import Roundels
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.foundation.columns import Columns
 from camera_node.geometry.outline import half_axes_of
 from fusion import _core
@@ -60,6 +61,7 @@ class Discs(Columns):
         position, normal: (3, N) centre, and unit normal out of the print; body frame.
         radius: (N,) of the black disc, metres.
         delay: (N,) time from the frame to the capture of the disc's row by a rolling shutter, seconds; None for 0.
+        zero: (3, N) unit vector to the zero of the disc's code; body frame. None where no code is read.
     """
 
     ROW_AXIS: ClassVar[int] = -1
@@ -71,6 +73,7 @@ class Discs(Columns):
     normal: Array
     radius: Array
     delay: Array | None = None
+    zero: Array | None = None
 
     @property
     def columns(self) -> _core.DiscColumns:
@@ -183,6 +186,8 @@ class DetectionTable(Columns):
         axes_px, angle_rad: (2, N) full axes and (N,) direction of the major axis of the outline, NaN where unknown.
         xy: (2, N) undistorted; NaN where the lens has no inverse.
         scale: (2, 2, N) Jacobians of raw pixels with respect to xy.
+        code: (N,) of the roundel, where it was read; otherwise -1.
+        rotation, rotation_sigma: (N,) of the code, see `Roundels`; NaN where unknown.
     """
 
     ROW_AXIS: ClassVar[int] = -1
@@ -197,6 +202,17 @@ class DetectionTable(Columns):
     angle_rad: Array
     xy: Array
     scale: Array
+    code: NDArray[np.int32]
+    rotation: Array
+    rotation_sigma: Array
+
+    def may_be(self, rows: Index, codes: Index) -> Mask:
+        """(K,) whether detections (rows) may be markers with these codes: all that have no name, or that one.
+
+        A name is certain to 1e-6. Twice the negative logarithm of that is above the gates of association, so that a
+        detection is no marker of another name.
+        """
+        return (self.code[rows] < 0) | (self.code[rows] == codes)
 
     @property
     def camera(self) -> Index:
@@ -247,7 +263,15 @@ class DetectionTable(Columns):
             _concatenate([f.roundels.angle_rad for f in frames], (0,)),
             _concatenate([f.xy for f in frames], (2, 0)),
             _concatenate([f.scale for f in frames], (2, 2, 0)),
+            np.concatenate([np.empty(0, np.int32), *(_codes(f.roundels) for f in frames)]),
+            _concatenate([f.roundels.rotation_rad for f in frames], (0,)),
+            _concatenate([f.roundels.rotation_sigma for f in frames], (0,)),
         )
+
+
+def _codes(roundels: Roundels) -> NDArray[np.int32]:
+    """(N,) codes that were read, -1 without; numbers that files give are none."""
+    return np.where(np.isfinite(roundels.id_probability), roundels.id, -1).astype(np.int32)
 
 
 def _concatenate(columns: list[Array], empty: tuple[int, ...]) -> Array:
@@ -263,6 +287,7 @@ class MarkerTable(Columns):
         number: (K,) index in the robot.
         position, normal: (3, K) centre, and unit normal out of the print; body frame.
         radius: (K,) of the black disc, metres.
+        code: (K,) of the marker, 0 for none; `zero` (3, K) its direction, body frame.
         first: (R + 1,): robot r has the rows first[r] to first[r + 1].
     """
 
@@ -274,6 +299,8 @@ class MarkerTable(Columns):
     position: Array
     normal: Array
     radius: Array
+    code: Index
+    zero: Array
     first: Index
 
     @classmethod
@@ -286,13 +313,15 @@ class MarkerTable(Columns):
             np.concatenate([np.empty((3, 0)), *(robot.points.T for robot in robots)], axis=1),
             np.concatenate([np.empty((3, 0)), *(robot.unit_normals.T for robot in robots)], axis=1),
             np.repeat([robot.diameter_m / 2 for robot in robots], counts),
+            np.concatenate([np.empty(0, np.intp), *(robot.codes for robot in robots)]).astype(np.intp),
+            np.concatenate([np.empty((3, 0)), *(robot.code_axes.T for robot in robots)], axis=1),
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
 
     def discs(self, rows: Index, frame: Index) -> Discs:
         """The markers `rows`, each in one frame."""
         of = self.select(rows)
-        return Discs(frame, of.robot, rows, of.position, of.normal, of.radius)
+        return Discs(frame, of.robot, rows, of.position, of.normal, of.radius, zero=of.zero)
 
     def expected(self, rows: Index, states: States, body: Index | None = None) -> _core.ExpectedMarkers:
         """The markers `rows` with the covariances of their positions; `body` is the row of the states of each.

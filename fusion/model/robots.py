@@ -81,7 +81,11 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
         self._require_apart()
         if self.is_single and self.normals:
             raise ValueError("a single marker defines the z axis of its robot: leave its normal out")
-        if len(self.markers) > 1 and np.linalg.matrix_rank(self.points - self.points[0], tol=0.02) < 2:
+        if (
+            len(self.markers) > 1
+            and not self.is_coded
+            and np.linalg.matrix_rank(self.points - self.points[0], tol=0.02) < 2
+        ):
             raise ValueError(
                 "two markers, or markers on one line, leave the rotation about the line unknown; "
                 "place a third 20 mm or more off the line, or use a single marker"
@@ -111,6 +115,11 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
     @property
     def is_single(self) -> bool:
         return len(self.markers) == 1
+
+    @property
+    def is_coded(self) -> bool:
+        """Whether a code tells it from all other robots, and its markers from each other."""
+        return any(self.codes)
 
     @property
     def densities(self) -> tuple[float, float]:
@@ -211,8 +220,9 @@ def require_distinct(robots: dict[str, Robot], where: str = "robots", known: Col
     Robots of the `known` names are not compared with each other.
     """
     new = {name: robot for name, robot in robots.items() if name not in known}
+    _require_own_codes(robots, where)
     for name, robot in new.items():
-        if fault := symmetry(robot):
+        if not robot.is_coded and (fault := symmetry(robot)):
             raise FusionError(f"{where}: robot '{name}' is {fault}")
     old = ((name, robots[name]) for name in robots if name in known)
     for (name_a, a), (name_b, b) in chain(combinations(new.items(), 2), product(old, new.items())):
@@ -220,8 +230,22 @@ def require_distinct(robots: dict[str, Robot], where: str = "robots", known: Col
             raise FusionError(f"{where}: robots '{name_a}' and '{name_b}' are {fault}")
 
 
+def _require_own_codes(robots: dict[str, Robot], where: str) -> None:
+    """Raise FusionError if two robots have a code in common."""
+    owner: dict[int, str] = {}
+    for name, robot in robots.items():
+        for code in filter(None, robot.codes):
+            if (other := owner.setdefault(code, name)) != name:
+                raise FusionError(
+                    f"{where}: robots '{other}' and '{name}' have the same code {code}: nothing would tell them apart; "
+                    "print another code for one of them"
+                )
+
+
 def _confusion(a: Robot, b: Robot) -> str | None:
     """Why two robots look alike; None if they differ."""
+    if a.is_coded and b.is_coded:
+        return None
     if max(a.diameter_m, b.diameter_m) > SIZES_DIFFER * min(a.diameter_m, b.diameter_m):
         return None
     if a.is_single and b.is_single:

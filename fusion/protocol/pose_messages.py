@@ -64,6 +64,7 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
     latency: Latency | None = None  # None offline
     evidence_age_s: float | None = None  # from the newest frame set in which a camera saw the robot to `t_ns`
     body_markers: int = 0  # markers of the robot; 0 if the server does not say it
+    has_code: bool = False  # of a marker: then a robot of one marker has a heading
     # Power spectral densities of its white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
     acceleration_density: tuple[float, float] | None = None
 
@@ -115,7 +116,10 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
             direction[-1] * np.array([self.velocity]),
             (direction[:, None] * self.covariance_matrix * direction)[None],
         )
-        densities, single = np.array([self.acceleration_density]), np.array([self.body_markers == 1])
+        densities, single = (
+            np.array([self.acceleration_density]),
+            np.array([self.body_markers == 1 and not self.has_code]),
+        )
         predicted, _ = predict(known, np.array([abs(dt)]), densities, single)
         P = direction[:, None] * predicted.P[0] * direction
         return msgspec.structs.replace(

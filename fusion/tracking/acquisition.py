@@ -19,6 +19,7 @@ from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import MAX_CHI2
 from fusion.tracking.identification import Identified, MissingConstellations, RefinedFits, WeakFits, identify
 from fusion.tracking.marker_search import MarkerSearch
+from fusion.tracking.named_markers import find_named
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.rays import Marker
 from fusion.tracking.single_markers import (
@@ -93,20 +94,25 @@ class Acquisition:
             assignments: of the tracked robots.
             histories: of unlabeled markers before this frame set.
         """
-        bodies, singles = missing[~table.single[missing]], missing[table.single[missing]]
+        named, left = missing[table.coded[missing]], missing[~table.coded[missing]]
+        by_name, why_not = self._acquire_named(table, named, detections, assignments)
+        assignments = assignments.joined(*(fits.assignments for fits in by_name))
+        bodies, singles = left[~table.single[left]], left[table.single[left]]
         # A marker of a constellation may be assigned to a single-marker robot: its assignments are searched too.
         is_single = table.single[table.markers.robot[assignments.marker]] & bool(len(bodies))
         of_singles, of_bodies = assignments.select(is_single), assignments.select(~is_single)
-        n_missing = int(np.isin(table.markers.robot, missing).sum())
+        n_missing = int(np.isin(table.markers.robot, left).sum())
         markers, crowded = self.search.find(table.markers, n_missing, detections, of_bodies)
-        found, reasons = self._acquire_bodies(table, bodies, markers, detections, of_bodies)
+        plain = [m for m in markers if (detections.code[m.detections] < 0).all()]
+        found, reasons = self._acquire_bodies(table, bodies, plain, detections, of_bodies)
         of_bodies = of_bodies.joined(*(fits.assignments for fits in found))
         displaced = np.unique(of_singles.marker[np.isin(of_singles.detection, of_bodies.detection)])
         assignments = of_bodies.joined(of_singles.select(~np.isin(of_singles.marker, displaced)))
-        markers = _without(markers, assignments)
-        choice = choose_markers(table, singles, markers, histories)
+        found, markers = [*by_name, *found], _without(markers, assignments)
+        plain = _without(plain, assignments)
+        choice = choose_markers(table, singles, plain, histories)
         if choice.pairs:
-            more = self._acquire_singles(table, choice, markers, detections)
+            more = self._acquire_singles(table, choice, plain, detections)
             found, markers = [*found, more], _without(markers, more.assignments)
             assignments = assignments.joined(more.assignments)
         return Acquired(
@@ -115,9 +121,25 @@ class Acquisition:
             table.markers.robot[displaced],
             assignments,
             markers,
-            reasons | choice.reasons,
+            why_not | reasons | choice.reasons,
             crowded,
         )
+
+    def _acquire_named(
+        self, table: TrackTable, missing: Index, detections: DetectionTable, assignments: Assignments
+    ) -> tuple[list[RefinedFits], dict[int, str]]:
+        """The coded robots that their codes identify, and why the others are not among them."""
+        if not len(missing):
+            return [], {}
+        free = np.setdiff1d(np.arange(len(detections)), assignments.detection)
+        named = find_named(self._cameras, table, missing, detections, free)
+        starts = Starts.of_named(named.robots, named.R, named.p, named.markers)
+        refined = self._refine(table, starts, detections)
+        fits = refined.misfit < MAX_CHI2
+        poor = dict.fromkeys(
+            refined.robot[~fits].tolist(), "the pictures of its codes do not fit its markers"
+        )
+        return [refined.select(fits)], named.reasons | poor
 
     def _acquire_bodies(
         self,

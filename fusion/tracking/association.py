@@ -142,6 +142,8 @@ class Association:
         poses = self.cameras.frame_poses(self.states, exposures)
         focal = self.cameras.focal[exposures.camera]
         pairs, cost = self.expected.candidates(poses, detections.columns, focal)
+        possible = detections.may_be(pairs[1], self.marker_table.code[self.markers[pairs[0]]])
+        pairs, cost = pairs[:, possible], cost[possible]
         marker, detection = pairs[:, assign(pairs, cost, detections.frame)]
         return detection, self.markers[marker]
 

@@ -20,6 +20,7 @@ from fusion import _core
 from fusion.model.observations import CameraArray, MatchedObservations
 from fusion.model.states import States, Transition, predict, reset_unobservable
 from fusion.tracking.gating import AXIS_SIGMA_PX
+from fusion.tracking.headings import linearize_headings, read_headings
 
 MAX_ITERATIONS = 8
 SMALL = 0.03  # rad and m; the second-order error of a smaller correction is below the noise of a detection
@@ -52,13 +53,14 @@ class _Problem:
 
     Attributes:
         observations: N observations.
-        shaped: (S,) rows whose outlines are observed too.
+        shaped, turned: (S,) and (T,) rows whose outlines and whose headings are observed too.
         bodies: (K,) rows of the states.
         prior: (K, 12, 12) information.
     """
 
     observations: MatchedObservations
     shaped: Index
+    turned: Index
     bodies: Index
     prior: Array
 
@@ -67,15 +69,15 @@ class _Problem:
         is_chosen = np.zeros(int(self.bodies[-1]) + 1, bool)
         is_chosen[self.bodies[rows]] = True
         mine = is_chosen[self.observations.discs.body]
-        is_shaped = np.zeros(len(mine), bool)
-        is_shaped[self.shaped] = True
+        number = np.cumsum(mine) - 1
         part = _Problem(
             self.observations.select(mine),
-            np.flatnonzero(is_shaped[mine]),
+            number[self.shaped[mine[self.shaped]]],
+            number[self.turned[mine[self.turned]]],
             self.bodies[rows],
             self.prior[rows],
         )
-        return part, np.concatenate([mine, mine[self.shaped]])
+        return part, np.concatenate([mine, mine[self.shaped], mine[self.turned]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,9 +88,9 @@ class _Solution:
         delta: (B, 12) errors of all bodies relative to the prediction.
         step: (K, 12) last step of the visible bodies.
         information: (K, 12, 12) of the visible bodies.
-        equations: (N + S, 2, 13) linearized.
-        weights: (N + S,) of the equations.
-        residuals: (2, N + S) whitened.
+        equations: (N + S + T, 2, 13) linearized.
+        weights: (N + S + T,) of the equations.
+        residuals: (2, N + S + T) whitened.
     """
 
     delta: Array
@@ -173,7 +175,8 @@ class Estimator:
         bodies = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
         if not len(bodies):
             return BodyFit(states, np.empty((2, 0)), np.empty((0, 2, 13)), np.empty(0))
-        problem = _Problem(observations, _shaped(observations), bodies, prediction.information[bodies])
+        extra = _shaped(observations), read_headings(observations)
+        problem = _Problem(observations, *extra, bodies, prediction.information[bodies])
         solution = self._solve(problem, states, np.zeros((n, 12)))
         for _ in range(MAX_ITERATIONS - 1):
             moved = np.abs(solution.step[:, :6]).max(1) >= small
@@ -223,7 +226,7 @@ class Estimator:
         """
         row = np.cumsum(np.bincount(problem.bodies, minlength=len(at))) - 1
         of_disc = problem.observations.discs.body
-        body = row[np.concatenate([of_disc, of_disc[problem.shaped]])]
+        body = row[np.concatenate([of_disc, of_disc[problem.shaped], of_disc[problem.turned]])]
         equations = self._linearize(at, problem)
         if weights is None:
             right, weights = np.zeros((len(problem.bodies), 12)), np.ones(len(equations))
@@ -237,16 +240,22 @@ class Estimator:
         return _Solution(delta, step, information, equations, weights, residuals)
 
     def _linearize(self, states: States, problem: _Problem) -> Array:
-        """(N + S, 2, 13) equations of the centres, then of the outlines; see `_core.FramePoses`."""
+        """(N + S + T, 2, 13) equations of centres, then of outlines, then of headings; see `_core.FramePoses`."""
         seen, discs = problem.observations.detections, problem.observations.discs
         poses = self.cameras.frame_poses(states, seen.exposures)
         equations = poses.linearize_centres(discs.columns, seen.xy, problem.observations.whiten, self.single)
-        if not len(problem.shaped):
-            return equations
-        discs, seen = discs.select(problem.shaped), seen.select(problem.shaped)
-        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
-        outlines = poses.linearize_outlines(discs.columns, seen.axes_px, seen.angle_rad, seen.scale, sigma)
-        return np.concatenate([equations, outlines])
+        parts = [equations]
+        if len(problem.shaped):
+            discs, seen = discs.select(problem.shaped), seen.select(problem.shaped)
+            sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
+            parts.append(
+                poses.linearize_outlines(discs.columns, seen.axes_px, seen.angle_rad, seen.scale, sigma)
+            )
+        if len(problem.turned):
+            parts.append(
+                linearize_headings(self.cameras, states, problem.observations.select(problem.turned))
+            )
+        return np.concatenate(parts)
 
     def _image_velocity(self, states: States, observations: MatchedObservations) -> Array:
         """(2, N) velocities of the discs' images, pixels/s; 0 where the disc is not visible."""

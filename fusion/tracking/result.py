@@ -166,6 +166,7 @@ def robot_poses(
             residual_px=residual[k] if markers[k] else None,
             evidence_age_s=age_s[k],
             body_markers=len(table.robots[k].markers),
+            has_code=table.robots[k].is_coded,
             acceleration_density=table.densities[k],
         )
         for k in rows

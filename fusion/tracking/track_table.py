@@ -25,7 +25,8 @@ class TrackTable:
 
     Attributes:
         names, robots, markers: the robots and their marker table.
-        single: (N,) robots with a single marker.
+        single: (N,) robots with a single marker, which has no code: their heading is unknown.
+        coded: (N,) robots with a code.
         densities: of their accelerations; see `MotionModel.densities`.
         owned: (N,) robots whose poses this server publishes; all of them in an arena without zones.
         searched: (N,) robots that it acquires while they are missing; the others belong to other zones.
@@ -39,7 +40,8 @@ class TrackTable:
         n = len(robots)
         self.names, self.robots = tuple(robots), list(robots.values())
         self.markers = MarkerTable.of(self.robots)
-        self.single = np.array([robot.is_single for robot in self.robots], bool)
+        self.coded = np.array([robot.is_coded for robot in self.robots], bool)
+        self.single = np.array([robot.is_single for robot in self.robots], bool) & ~self.coded
         self.densities = [robot.densities for robot in self.robots]
         self.owned, self.searched = np.ones((2, n), bool)
         self.states = States.at_rest(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), START_SIGMAS)

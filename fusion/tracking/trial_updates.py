@@ -82,6 +82,8 @@ def _detected(
     expected = markers.expected(rows, state, np.zeros(len(rows), np.intp))
     poses, focal = cameras.frame_poses(state, exposures), cameras.focal[exposures.camera]
     pairs, cost = expected.candidates(poses, detections.columns, focal)
+    possible = detections.may_be(pairs[1], markers.code[rows[pairs[0]]])
+    pairs, cost = pairs[:, possible], cost[possible]
     marker, detection = pairs[:, assign(pairs, cost, detections.frame)]
     detected = np.zeros((len(rows), len(exposures.camera)), bool)
     detected[marker, detections.frame[detection]] = True
@@ -142,6 +144,14 @@ class Starts:
         assignments, of = _assigned([markers[p] for p in mappings.points.ravel().tolist()], rows.ravel())
         body = np.repeat(np.arange(len(fits)), mappings.points.shape[1])[of]
         return cls(mappings.robot, States.at_rest(fits.R, fits.t, START_SIGMAS), assignments, body)
+
+    @classmethod
+    def of_named(cls, robots: list[int], R: Array, p: Array, markers: list[dict[int, Marker]]) -> "Starts":
+        """Robots (rows) at R (K, 3, 3) and p (K, 3), with their markers by row of the marker table."""
+        rows = np.array([row for of in markers for row in of], np.intp)
+        assignments, of = _assigned([marker for of in markers for marker in of.values()], rows)
+        start = np.repeat(np.arange(len(markers)), [len(of) for of in markers])
+        return cls(np.array(robots, np.intp), States.at_rest(R, p, START_SIGMAS), assignments, start[of])
 
     @classmethod
     def of_singles(

@@ -20,6 +20,7 @@ from tests.fusion.equations import outlines
 
 PERIOD_NS = 33_333_333
 START_NS = 1_000_000_000_000
+ROTATION_SIGMA = 0.005  # rad, of codes
 ROW_STEPS, STEP_S = 4, 1e-4  # of the iteration for the rows of markers; of a difference quotient
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 
@@ -165,31 +166,37 @@ class Arena:
         for _ in range(ROW_STEPS if self.readout_s else 0):
             uv = camera.project_world(self._place(marker_table, seen, t_s)[0])
             t_s = t + self.readout_s * np.nan_to_num(camera.image_row(uv)).clip(-0.5, 0.5)
-        (centre, normal), (later, _) = (self._place(marker_table, seen, t_s + dt) for dt in (0.0, STEP_S))
+        (centre, normal, zero), (later, *_) = (
+            self._place(marker_table, seen, t_s + dt) for dt in (0.0, STEP_S)
+        )
         speed = (camera.project_world(later) - camera.project_world(centre)) / STEP_S
         shear = speed * self.readout_s / camera.height
-        return self._roundels(camera, (seen, centre, normal, marker_table.radius[seen], shear), rng)
+        code = marker_table.code[seen]
+        return self._roundels(
+            camera, (seen, centre, normal, marker_table.radius[seen], shear, zero, code), rng
+        )
 
     def _place(
         self, markers: MarkerTable, rows: np.ndarray, t_s: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Centres and normals (N, 3) of markers, each at its own time (N,)."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centres, normals and directions to the zeros of codes (N, 3) of markers, each at its own time (N,)."""
         robots = list(self.robots)
         poses = [self.motions[robots[markers.robot[k]]](t) for k, t in zip(rows, t_s, strict=True)]
         R = np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)
         p = np.array([pose[1] for pose in poses]).reshape(-1, 3)
         centre = p + np.einsum("nij,jn->ni", R, markers.position[:, rows])
-        return centre, np.einsum("nij,jn->ni", R, markers.normal[:, rows])
+        normal, zero = (np.einsum("nij,jn->ni", R, v[:, rows]) for v in (markers.normal, markers.zero))
+        return centre, normal, zero
 
     def _roundels(self, camera: Camera, discs: tuple[np.ndarray, ...], rng: np.random.Generator) -> Roundels:
-        """Outlines of discs; `id` is the row of the marker table, -1 for distractors.
+        """Outlines of discs; `id` is the code, or else the row of the marker table, -1 for distractors.
 
         The centres come from sampled circles, independently of the model under test.
 
         Args:
             camera: that sees them.
             discs: rows of the marker table (N,), centres and normals (N, 3), radii (N,), and the motion of the image
-                from one row to the next (N, 2), pixels.
+                from one row to the next (N, 2), pixels; directions of codes (N, 3) and codes (N,).
             rng: of noise, distractors and order.
         """
         to = camera.matrix()[:3, 3] - discs[1]
@@ -198,10 +205,16 @@ class Arena:
         uv = np.array([outline_centre(camera, *disc) for disc in zip(*discs[1:4], strict=True)])
         uv = uv.reshape(-1, 2)
         inside = ((uv > 15) & (uv < [785, 585])).all(1)
-        uv, (number, centre, normal, radius, shear) = uv[inside], (column[inside] for column in discs)
+        uv, (number, centre, normal, radius, shear, zero, code) = (
+            uv[inside],
+            (column[inside] for column in discs),
+        )
         S = np.linalg.inv(np.eye(2) - shear[:, :, None] * [0.0, 1.0])
         shape = S @ self._outlines(camera, centre, normal, radius) @ S.transpose(0, 2, 1)
         values, vectors = np.linalg.eigh(shape) if len(uv) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
+        rim = camera.project_world(centre + radius[:, None] * zero).reshape(-1, 2) - uv
+        q = np.einsum("nji,nj->ni", vectors, rim) / np.sqrt(values)
+        q = np.einsum("nij,nj->ni", vectors, q)
         axes = 2 * np.sqrt(values[:, ::-1])
         angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
         extra = self.distractors
@@ -213,8 +226,15 @@ class Arena:
         n, order = len(uv), rng.permutation(len(uv))
         cov = np.tile(max(self.sigma_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1))
         level, none = np.full(n, 0.6), np.full(n, -1, np.int32)
-        number = np.concatenate([number, np.full(extra, -1, np.int32)])
-        return Roundels(uv, cov, axes, angle, level, 200 * level, number, none).select(order)
+        unread = np.full(extra, np.nan)
+        number = np.concatenate([np.where(code > 0, code, number), np.full(extra, -1)]).astype(np.int32)
+        sure, turn, sigma = (
+            np.concatenate([np.where(code > 0, value, np.nan), unread])
+            for value in (1.0, np.arctan2(q[:, 1], q[:, 0]), ROTATION_SIGMA)
+        )
+        turn = turn + ROTATION_SIGMA * np.sign(self.sigma_px) * np.cos(1e6 * uv[:, 0])
+        columns = (uv, cov, axes, angle, level, 200 * level, number, none, sure, turn, sigma)
+        return Roundels(*columns).select(order)
 
     def _outlines(self, camera: Camera, centre, normal, radius) -> np.ndarray:
         """(N, 2, 2) shape matrices."""
