@@ -21,6 +21,7 @@ constexpr double kMaxError = 1e-6;          // probability of a wrong name that 
 constexpr double kCovered = 0.02;           // prior probability that something covers a sector
 constexpr double kChanged = 1e-3;           // and that a track has become another roundel's
 constexpr double kModelError = 0.1;         // of a sector's level, contrasts
+constexpr double kRemembered = 10;          // frames of a mean: errors of fits differ from frame to frame
 constexpr double kNegligible = -40;         // log-likelihoods that add less than 1e-15 to 1
 constexpr double kInterpolation = 1 / 6.0;  // variance that bilinear interpolation adds to blur, px^2
 
@@ -170,13 +171,13 @@ FrameScores score(const SectorLevels& sectors, const std::array<double, kCodeSec
 }
 
 /// Adds a frame's log-likelihoods to the means of its track.
-void add_frame(CodeEvidence& evidence, const FrameScores& frame, double rho, double prior) {
+void add_frame(CodeEvidence& evidence, const FrameScores& frame, double prior) {
     std::vector<float>& means = evidence.means;
     const auto known = size_t(std::max_element(means.begin(), means.end()) - means.begin());
     const auto update = [&](size_t k, float now) { means[k] += float((now - means[k]) / evidence.count); };
     // Words differ so much that one which a frame alone proves excludes all others.
     if (known && frame.of_code(known) - frame.none > prior - std::log(kMaxError)) {
-        evidence.count = std::min(evidence.count + 1, 1 / rho);
+        evidence.count = std::min(evidence.count + 1, kRemembered);
         update(0, frame.none);
         update(known, frame.of_code(known));
         return;
@@ -189,7 +190,7 @@ void add_frame(CodeEvidence& evidence, const FrameScores& frame, double rho, dou
         means.assign(now.size(), 0);
         evidence.count = 0;
     }
-    evidence.count = std::min(evidence.count + 1, 1 / rho);
+    evidence.count = std::min(evidence.count + 1, kRemembered);
     for (size_t k = 0; k < now.size(); ++k) update(k, now[k]);
 }
 
@@ -263,7 +264,7 @@ CodeReading CodeTrack::add(const ImageView& image, const RoundelFit& fit) {
     const double rho = square(kModelError) / (square(kModelError) + square(noise));
     const size_t n_codes = code_words().size();
     const double prior = std::log(double(n_codes) * kCodeSectors);
-    add_frame(evidence_, frame, rho, prior);
+    add_frame(evidence_, frame, prior);
 
     // No code is as probable as any code at any turn.
     const std::vector<float>& means = evidence_.means;

@@ -18,7 +18,7 @@ struct CodeReading {
 
 /// Mean log-likelihoods of the frames of a track: of no code, then of each code.
 struct CodeEvidence {
-    double count = 0;  // frames, at most 1 / rho
+    double count = 0;  // frames
     std::vector<float> means;
 };
 
