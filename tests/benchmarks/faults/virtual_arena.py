@@ -165,6 +165,7 @@ class VirtualArena:
         server.clock = self.clock  # pyright: ignore[reportAttributeAccessIssue]
         self._outbox = Outbox(self.judge)
         server.transport = self._outbox  # pyright: ignore[reportAttributeAccessIssue]
+        server.zones = None
         return server
 
     def _schedule(self, name: str, seq: int) -> None:
