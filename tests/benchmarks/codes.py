@@ -13,7 +13,7 @@ from camera_node.geometry import codes
 from camera_node.simulation.sensor import SENSORS, SensorName
 from tests.benchmarks.detector.negatives import clutter, letters, text_pages
 from tests.benchmarks.detector.photographs import photographs
-from tests.benchmarks.detector.pictures import Card, grid, missed, paste, sight_of
+from tests.benchmarks.detector.pictures import Card, grid, missed, paste, rotation_of
 from tests.benchmarks.detector.recall import SIZE, ground
 from tests.benchmarks.detector.table import table
 
@@ -40,21 +40,6 @@ class Count:
         )
         shares = (100 * n / self.shown for n in (self.found, self.named))
         return *(f"{x:.1f}" for x in shares), str(self.wrong), *(f"{x:.2f}" for x in rms)
-
-
-def rotation_of(card: Card) -> float:
-    """`Roundel.rotation_rad` of the card, by its true outline."""
-    sight = sight_of(card, (SIZE[1], SIZE[0]))
-    n, c, r = sight.normal, sight.position, sight.diameter_m / 2
-    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
-    first /= np.linalg.norm(first)
-    zero = c + r * (np.cos(card.spin) * first + np.sin(card.spin) * np.cross(n, first))
-    dual = sight.lens.K @ (np.outer(c, c) - r * r * (np.eye(3) - np.outer(n, n))) @ sight.lens.K.T
-    dual /= dual[2, 2]
-    centre = dual[:2, 2]
-    values, axes = np.linalg.eigh(np.outer(centre, centre) - dual[:2, :2])
-    u, v = axes @ ((axes.T @ (sight.lens.project(zero[None])[0] - centre)) / np.sqrt(values))
-    return float(np.arctan2(v, u))
 
 
 def cards(diameter: float, tilt_deg: float, count: int, rng: np.random.Generator) -> list[Card]:
@@ -92,7 +77,7 @@ def compare(
         count.named += 1
         count.wrong += roundel.id != card.code
         if np.isfinite(roundel.rotation_rad):
-            off = roundel.rotation_rad - rotation_of(card)
+            off = roundel.rotation_rad - rotation_of(card, SIZE)
             count.errors.append(float((off + np.pi) % (2 * np.pi) - np.pi))
             count.sigmas.append(roundel.rotation_sigma)
     return count

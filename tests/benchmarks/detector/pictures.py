@@ -84,6 +84,21 @@ def sight_of(card: Card, size: tuple[int, int], focal: float = F) -> Sight:
     return Sight(lens, card.uv, distance, tilt=card.tilt, turn=card.turn, ground=0.0, **of_print)
 
 
+def rotation_of(card: Card, size: tuple[int, int]) -> float:
+    """`Roundel.rotation_rad` by the true outline, where a code's zero is seen on it; in an image of size (h, w)."""
+    sight = sight_of(card, (size[1], size[0]))
+    n, c, r = sight.normal, sight.position, sight.diameter_m / 2
+    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
+    first /= np.linalg.norm(first)
+    zero = c + r * (np.cos(card.spin) * first + np.sin(card.spin) * np.cross(n, first))
+    dual = sight.lens.K @ (np.outer(c, c) - r * r * (np.eye(3) - np.outer(n, n))) @ sight.lens.K.T
+    dual /= dual[2, 2]
+    centre = dual[:2, 2]
+    values, axes = np.linalg.eigh(np.outer(centre, centre) - dual[:2, :2])
+    u, v = axes @ ((axes.T @ (sight.lens.project(zero[None])[0] - centre)) / np.sqrt(values))
+    return float(np.arctan2(v, u))
+
+
 def _bound(sight: Sight, blur: float) -> tuple[int, int, int, int]:
     """The part of the image that a card may touch, u0, v0, u1, v1. It is larger far from the optical axis."""
     (u, v), axes = ellipse_of(replace(sight, diameter_m=sight.card * sight.diameter_m))

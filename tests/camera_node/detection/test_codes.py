@@ -10,7 +10,7 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import DetectedRoundels
 from camera_node.foundation.arrays import Grey, Index
 from camera_node.geometry import codes
-from tests.benchmarks.detector.pictures import Card, dead_leaves, expose, flat, grid, paste, sight_of
+from tests.benchmarks.detector.pictures import Card, dead_leaves, expose, flat, grid, paste, rotation_of
 
 SIZE = (300, 400)
 
@@ -32,21 +32,6 @@ def picture(shown: list[Card], seed: int, clutter: bool = True) -> Grey:
     return expose(paste(dead_leaves(SIZE, rng) if clutter else flat(SIZE, 90.0), shown), 3.0, rng)
 
 
-def rotation_of(card: Card) -> float:
-    """`rotation_rad` of the true outline: where the code's zero is seen on the outer edge."""
-    sight = sight_of(card, (SIZE[1], SIZE[0]))
-    n, c, r = sight.normal, sight.position, sight.diameter_m / 2
-    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
-    first /= np.linalg.norm(first)
-    zero = c + r * (np.cos(card.spin) * first + np.sin(card.spin) * np.cross(n, first))
-    dual = sight.lens.K @ (np.outer(c, c) - r * r * (np.eye(3) - np.outer(n, n))) @ sight.lens.K.T
-    dual /= dual[2, 2]
-    centre = dual[:2, 2]
-    values, axes = np.linalg.eigh(np.outer(centre, centre) - dual[:2, :2])
-    u, v = axes @ ((axes.T @ (sight.lens.project(zero[None])[0] - centre)) / np.sqrt(values))
-    return float(np.arctan2(v, u))
-
-
 def rows_of(found: DetectedRoundels, shown: list[Card]) -> Index:
     """The detection of each card."""
     apart = np.linalg.norm(found.uv[None] - np.array([card.uv for card in shown])[:, None], axis=2)
@@ -63,7 +48,7 @@ def test_one_frame_names_and_turns_cards(diameter: float, tilt: float):
     rows = rows_of(found, shown)
     assert found.id[rows].tolist() == [card.code for card in shown]
     assert (found.id_probability[rows] > 1 - 2e-6).all()
-    error = found.rotation_rad[rows] - [rotation_of(card) for card in shown]
+    error = found.rotation_rad[rows] - [rotation_of(card, SIZE) for card in shown]
     error = (error + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(error).max() < codes.STEP / 4
     assert np.mean((error / found.rotation_sigma[rows]) ** 2) < 3
