@@ -2,7 +2,7 @@
 """A hall in zones: `python -m tests.benchmarks.halls_zones [--zones 4 --robots 100]`, in virtual time on one core.
 
 Robots drive through the whole hall. Prints the longest gap between a robot's poses, poses of two zones at once, errors
-beside those of one server, and the processor time of a frame set by zone: with more zones of equal size it stays.
+beside those of one server, and the processor time of a frame set by zone.
 """
 
 import time
