@@ -227,11 +227,10 @@ def estimate_lens_priors(problem: Problem, adjusted: Adjusted) -> Problem:
     sigma, unknown = _choose_sigma(adjusted.problem, information, gradient)
     prior, wider = problem.lens_sigma.copy(), problem.lens_sigma.copy()
     # The smoothness of the motion between frames biases what images hardly determine: to lenses that are farther off.
-    trusted = (np.inf if adjusted.problem.gap_s == 0 else 1.0) >= SHARES
-    prior[estimated] = sigma * estimate_shares(
-        information, gradient, sigma, unknown, trusted * SPIKE_AND_SLAB
-    )
-    heavy = sigma * estimate_shares(information, gradient, sigma, unknown, trusted * STUDENT)
+    most = np.inf if adjusted.problem.gap_s == 0 else 1.0
+    estimate, claim = (np.where(most >= SHARES, p, 0.0) for p in (SPIKE_AND_SLAB, STUDENT))
+    prior[estimated] = sigma * estimate_shares(information, gradient, sigma, unknown, estimate)
+    heavy = sigma * estimate_shares(information, gradient, sigma, unknown, claim)
     wider[estimated] = np.maximum(heavy, prior[estimated])
     return replace(problem, lens_sigma=prior, covariance_lens_sigma=wider)
 
