@@ -14,11 +14,12 @@ from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
 from fusion.model.corrections import ExtrinsicsCorrection, corrected_camera, with_errors_of
-from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import Robots, RobotsRequest
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.server.search_turns import SearchTurns
 from fusion.server.server_statistics import PipelineStatus
 from fusion.server.storage.active_rig import ActiveRig, renamed
 from fusion.server.storage.active_robots import ActiveRobots
@@ -28,7 +29,6 @@ from fusion.tracking.tracker import Tracker
 log = logging.getLogger("fusion")
 
 NOT_CALIBRATED = "the cameras are not calibrated"
-MAX_UNSEARCHED_NS = 1_000_000_000  # a server that always lags searches for missing robots once a second
 
 
 class TrackingPipeline:
@@ -56,7 +56,7 @@ class TrackingPipeline:
         self.synchronizer: FrameSynchronizer
         self.early: AssociatedFrames | None = None  # of the open frame set
         self._is_wand_recorded = False
-        self._searched_ns = 0  # time of the last frame set in which missing robots were searched for
+        self.searches = SearchTurns()
         self._judging: Executor | None = None
         self._start(self.cameras)
         self.active_rig.load(lambda rig: self._start(rig.placed()))
@@ -229,21 +229,6 @@ class TrackingPipeline:
         frame_set, n_missing = self.synchronizer.open()
         if self.tracker is not None and frame_set is not None:
             self.early = self.tracker.associate_early(frame_set, n_missing, self.early)
-
-    def with_search(self, frame_set: FrameSet, is_late: bool) -> FrameSet:
-        """The frame set, in which missing robots are searched for unless others wait.
-
-        A search may last as long as many frame sets. Those that wait are tracked without one first, so that robots that
-        were just found are not lost.
-
-        Args:
-            frame_set: the next one.
-            is_late: whether others wait.
-        """
-        searches = not is_late or abs(frame_set.t_ns - self._searched_ns) > MAX_UNSEARCHED_NS
-        if searches:
-            self._searched_ns = frame_set.t_ns
-        return replace(frame_set, is_searched=searches)
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None while its camera is withheld, or if it is in the future."""

@@ -214,7 +214,7 @@ class Server:
         frame_sets = self._synchronize(now_ns, is_backlogged)
         for k, frame_set in enumerate(frame_sets):
             is_late = k + 1 < len(frame_sets) or (is_backlogged and self._lags(now_ns))
-            self._track(self.pipeline.with_search(frame_set, is_late))
+            self._track(self.pipeline.searches.decide(frame_set, is_late))
         if not is_backlogged:
             self.pipeline.associate_early()
 

@@ -275,6 +275,7 @@ class Tracker:
     def _acquire(self, update: Update) -> tuple[Update, Acquired]:
         """Acquire missing robots; returns the update with their assignments."""
         if not update.is_searched:
+            self.acquisition.n_unsearched += 1
             return update, Acquired.none(self.table, update.assignments)
         missing = np.flatnonzero(~update.tracked & self.table.searched & (not self.acquires_none))
         histories = partial(self.unlabeled.histories, update.t_ns)

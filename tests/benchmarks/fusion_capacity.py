@@ -28,7 +28,8 @@ from fusion.protocol.pose_messages import Latency, RobotPose, TrackingState
 from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Ingest
-from fusion.server.server import collecting_between_frame_sets
+from fusion.server.search_turns import SearchTurns
+from fusion.server.server import MAX_LAG_NS, collecting_between_frame_sets
 from fusion.server.server_statistics import PipelineStatus, ServerStatistics
 from fusion.tracking.association import AssociatedFrames
 from fusion.tracking.tracker import Tracker, Update
@@ -128,6 +129,7 @@ class Queue:
         self._done_ns = Series(room)  # processor time at the end of each frame set
         self._warm = False
         self._early: AssociatedFrames | None = None
+        self._searches = SearchTurns()
 
     def step(self, message: Detections, arrival_ns: int) -> bool:
         """Process a message; return whether that completed a frame set. The first `START_S` seconds do not count."""
@@ -140,7 +142,8 @@ class Queue:
         if self.free_ns < arrival_ns:
             self._spend(self._associate_early)
         self.free_ns = max(self.free_ns, arrival_ns)
-        is_complete = self._take(data, key, arrival_ns)
+        is_dropped = self.free_ns > arrival_ns + MAX_LAG_NS
+        is_complete = not is_dropped and self._take(data, key, arrival_ns)
         if arrival_ns - self._collected_ns > 1e9:
             self._spend(gc.collect)
             self._spend(lambda: self._statistics.report(arrival_ns, PipelineStatus()))
@@ -160,7 +163,9 @@ class Queue:
     def _take(self, data: bytes, key: str, arrival_ns: int) -> bool:
         self._spend(lambda: self._add(data, key, arrival_ns))
         frame_sets = self._spend(lambda: self.synchronizer.take(arrival_ns))
-        for frame_set in frame_sets:
+        for k, closed in enumerate(frame_sets):
+            is_late = k + 1 < len(frame_sets) or self.free_ns > arrival_ns + 1e9 / self.load.hz
+            frame_set = self._searches.decide(closed, is_late)
             update = self._spend(lambda frame_set=frame_set: self._update(frame_set))
             first = list(update.poses.values())
             self._spend(lambda first=first: self._encode(first))
