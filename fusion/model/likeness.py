@@ -9,6 +9,7 @@ differ from all other sides and from itself under rotation, as a flat robot must
 """
 
 import math
+from bisect import bisect
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, product
@@ -36,17 +37,21 @@ def sides(body: Body) -> list[Index]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Markers:
-    """Some markers of a body: numbers (M,), positions (M, 3) and normals (M, 3), body frame; distances (M, M)."""
+    """Some markers of a body: numbers (M,), positions (M, 3) and normals (M, 3), body frame; distances (M, M), and
+    these sorted, one for each pair."""
 
     numbers: Index
     points: Array
     normals: Array
     distance: Array
+    lengths: list[float]
 
     @classmethod
     def of(cls, body: Body, numbers: Index) -> "_Markers":
         points = body.points[numbers]
-        return cls(numbers, points, body.unit_normals[numbers], distances(points))
+        distance = distances(points)
+        lengths = sorted(distance[np.triu_indices(len(points), 1)].tolist())
+        return cls(numbers, points, body.unit_normals[numbers], distance, lengths)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -91,6 +96,8 @@ def _list(markers: _Markers) -> str:
 
 def _alike(small: _Markers, large: _Markers) -> str | None:
     """How the markers of `small` match some of `large`; for the same ones, in another order. None if they don't."""
+    if not _may_match(small.lengths, large.lengths):
+        return None
     D, E = small.distance, large.distance
     orders = _labelings(D, E)
     if small is large:
@@ -100,6 +107,16 @@ def _alike(small: _Markers, large: _Markers) -> str | None:
         if _may_be_seen_as(small, large, orders[k]):
             return _explain(small, large, orders[k], worst[k])
     return None
+
+
+def _may_match(few: list[float], many: list[float]) -> bool:
+    """Whether each of the sorted distances `few` may be another one of `many`: most pairs of robots fail this at once.
+
+    A matching of equally many numbers within a bound exists only if they match in order.
+    """
+    if len(few) == len(many):
+        return all(abs(a - b) < DISTINCT_M for a, b in zip(few, many, strict=True))
+    return all(bisect(many, a - DISTINCT_M) < bisect(many, a + DISTINCT_M) for a in few)
 
 
 def _may_be_seen_as(small: _Markers, large: _Markers, order: Index) -> bool:

@@ -9,7 +9,9 @@ a fit counts both, and is chi-square if all claims hold (Bar-Shalom et al. 2001,
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import (
+    chdtri,  # the inverse survival function of chi-square, without a check of each argument
+)
 
 from camera_node.foundation.arrays import Array, Index
 from fusion._core import CAUCHY, SLACK_PX
@@ -45,7 +47,7 @@ class ResidualMonitor:
         if self._learned < LEARNED or count.sum() < MIN_RESIDUALS:
             return False
         n = 2 * int(count.sum())
-        limit = max(float(chi2.isf(FALSE_ALARM, n)) / n, MIN_RATIO**2 * self._usual_cost)
+        limit = max(float(chdtri(n, FALSE_ALARM)) / n, MIN_RATIO**2 * self._usual_cost)
         return bool(_mean_cost(cost, count) > limit)
 
     def is_explained(self, cost: float, count: int) -> bool:
@@ -55,7 +57,7 @@ class ResidualMonitor:
             cost: what they add to the cost of the fit.
             count: of these detections; they show nothing if they have no more equations than a pose has errors.
         """
-        allowed = chi2.isf(REJOINED, 2 * count) * max(1.0, self._usual_cost)
+        allowed = chdtri(2 * count, REJOINED) * max(1.0, self._usual_cost)
         return 2 * count > POSE_ERRORS and bool(cost < allowed)
 
     def learn(self, squared_px: Array, cost: Array, count: Index) -> None:

@@ -10,6 +10,7 @@ import pytest
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector
 from fusion.errors import FusionError
+from fusion.model import likeness
 from fusion.model.robots import (
     MAX_ROBOTS,
     Robot,
@@ -170,3 +171,14 @@ def test_the_comparison_of_seven_markers_is_fast():
     begun = time.process_time()
     require_distinct(robots)
     assert time.process_time() - begun < 2.0  # 0.1 s; it was 5 s
+
+
+@pytest.mark.parametrize("sizes", [(3, 3), (4, 4), (3, 5)])
+def test_distances_that_do_not_match_in_order_have_no_labeling(sizes: tuple[int, int]):
+    rng, refused = np.random.default_rng(4), 0
+    for _ in range(300):
+        few, many = (likeness.distances(rng.uniform(0, 0.12, (n, 3))) for n in sizes)
+        if not likeness._may_match(*(sorted(D[np.triu_indices(len(D), 1)].tolist()) for D in (few, many))):
+            refused += 1
+            assert not len(likeness._labelings(few, many))
+    assert refused > 50
