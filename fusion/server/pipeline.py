@@ -18,8 +18,7 @@ from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import Robots, RobotsRequest
 from fusion.server.arena_config import ArenaConfig
-from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.server.search_turns import SearchTurns
+from fusion.server.frame_synchronizer import FrameSynchronizer, SearchTurns
 from fusion.server.server_statistics import PipelineStatus
 from fusion.server.storage.active_rig import ActiveRig, renamed
 from fusion.server.storage.active_robots import ActiveRobots

@@ -26,9 +26,8 @@ from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import Latency, RobotPose, TrackingState
 from fusion.rig_graph.rig_monitor import JudgeProcess
-from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.server.frame_synchronizer import FrameSynchronizer, SearchTurns
 from fusion.server.ingest import Ingest
-from fusion.server.search_turns import SearchTurns
 from fusion.server.server import MAX_LAG_NS, collecting_between_frame_sets
 from fusion.server.server_statistics import PipelineStatus, ServerStatistics
 from fusion.tracking.association import AssociatedFrames

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
-from fusion.server.search_turns import SearchTurns
+from fusion.server.frame_synchronizer import SearchTurns
 from fusion.tracking.acquisition import Acquisition
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.faults.arena import small_load
