@@ -111,7 +111,10 @@ SectorLevels find_sectors(const Profile& profile) {
             at.black[size_t(k)] = black / (m / 2);
             if (std::isfinite(black)) apart += square(std::clamp(at.black[size_t(k)], 0.0, 1.0) - 0.5);
         }
-        if (apart > most) most = apart, best = at;
+        if (apart > most) {
+            most = apart;
+            best = at;
+        }
     }
     return best;
 }
@@ -162,7 +165,8 @@ FrameScores score(const SectorLevels& sectors, const std::array<double, kCodeSec
             const double error = square(sectors.black[k] - due) / variance;
             return float(std::log(peak * std::exp(-error / 2) + kCovered * any));
         };
-        white[k] = log_likelihood(0), black[k] = log_likelihood(1);
+        white[k] = log_likelihood(0);
+        black[k] = log_likelihood(1);
         frame.none += float(std::log(any));
     }
     frame.low = add_up(white.data(), black.data());

@@ -98,10 +98,11 @@ class First:
 
     def show(self, band: tuple[int, int], rng: np.random.Generator) -> Picture:
         """A picture of twenty prints of a band of sizes."""
-        cards = [
-            Card(uv, *(float(rng.uniform(*limits)) for limits in (band, (0, np.pi / 3), (0, 2 * np.pi))))
-            for uv in grid(20, SIZE, rng)
-        ]
+        def draw() -> tuple[float, float, float]:
+            size, slant, azimuth = (rng.uniform(*limits) for limits in (band, (0, np.pi / 3), (0, 2 * np.pi)))
+            return float(size), float(slant), float(azimuth)
+
+        cards = [Card(uv, *draw()) for uv in grid(20, SIZE, rng)]
         sights = [replace(sight_of(card, (SIZE[1], SIZE[0])), bend=self.bend) for card in cards]
         if self.bend:
             light = _traced(sights)
