@@ -98,6 +98,7 @@ class First:
 
     def show(self, band: tuple[int, int], rng: np.random.Generator) -> Picture:
         """A picture of twenty prints of a band of sizes."""
+
         def draw() -> tuple[float, float, float]:
             size, slant, azimuth = (rng.uniform(*limits) for limits in (band, (0, np.pi / 3), (0, 2 * np.pi)))
             return float(size), float(slant), float(azimuth)
