@@ -38,7 +38,7 @@ from calib.wand.detections import (
     count_frames,
     gather_background,
 )
-from calib.wand.focal_lengths import with_rough_focal_lengths
+from calib.wand.focal_lengths import has_unknown, with_rough_focal_lengths
 from calib.wand.initial_rig import (
     InitialRig,
     TwoViewGeometry,
@@ -180,9 +180,22 @@ def _calibrate_aligned(
 
 
 def _calibrate(rig: Rig, wand: Body, given: _Recorded, distance: Distance | None) -> WandCalibration:
+    """Calibrate from rough focal lengths of unknown lenses, or from the given ones where these lead to no rig.
+
+    Raises CalibrationError as `calibrate`, of a recording that fits the rig.
+    """
+    rough = with_rough_focal_lengths(rig, wand, given.messages)
+    try:
+        return _calibrate_from(rough, wand, given, distance)
+    except CalibrationError:
+        if rough is rig:
+            raise
+        return _calibrate_from(rig, wand, given, distance)
+
+
+def _calibrate_from(rig: Rig, wand: Body, given: _Recorded, distance: Distance | None) -> WandCalibration:
     """Raises CalibrationError as `calibrate`, of a recording that fits the rig."""
     messages, background = given.messages, given.background
-    rig = with_rough_focal_lengths(rig, wand, messages)
     recording, timing = label_by_timing(rig, wand, messages, given.synchronous)
     start_ns = min(message.t_ns for message in messages)
     lenses = [rig.cameras[name] for name in recording.names]
@@ -489,8 +502,12 @@ def _prepare_fine(
 
 
 def _adjust_finely(fine: Estimate, inflation: float) -> Solution:
-    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these."""
-    first = adjust(fine.problem, fine.observations, fine.state, rounds=1, profiled=True)
+    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these.
+
+    With unknown lenses the start is kept: the optimum of path and lenses together may be far away.
+    """
+    is_rough = has_unknown(fine.problem.lenses)
+    first = adjust(fine.problem, fine.observations, fine.state, rounds=1, profiled=is_rough)
     problem = estimate_lens_priors(fine.problem, replace(first, inflation=inflation))
     return Solution(adjust(problem, fine.observations, first.state, profiled=True), fine.observations)
 

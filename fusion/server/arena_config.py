@@ -11,7 +11,7 @@ import msgspec
 from camera_node.foundation.config import NAME_RULE, is_name, load_yaml
 from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.session import LOOPBACK
-from fusion.model.limits import Limits
+from fusion.model.limits import LimitSettings
 
 ANY_HOST = re.compile(r"(\w+)/.*:(\d+)")
 
@@ -60,7 +60,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     cameras: str | None = None
     audit: str | None = None
     rate_hz: float | None = None
-    limits: Limits = Limits()
+    limits: LimitSettings = LimitSettings()
     zones: tuple[Zone, ...] = ()
     zone: str | None = None
 

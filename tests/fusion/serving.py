@@ -15,7 +15,7 @@ from calib.rig.rig import Rig, save_rig
 from camera_node.foundation.config import dump_yaml
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.client.arena import Arena as Client
-from fusion.model.limits import Limits
+from fusion.model.limits import LimitSettings
 from fusion.server.arena_config import ArenaConfig, Zone
 from fusion.server.server import Server
 from tests.conftest import ROOT
@@ -24,7 +24,7 @@ from tests.waiting import DEADLINE_S, Inbox, wait_for
 
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
-REAL_TIME_MS = Limits().lateness_ms  # of a server whose cameras send frames when they take them
+REAL_TIME_MS = LimitSettings().lateness_ms  # of a server whose cameras send frames when they take them
 ATTEMPT_S = 3.0  # from a burst of frames to poses, before the burst is sent again
 
 
@@ -43,7 +43,7 @@ def config(folder: Path, with_rig: bool = True, lateness_ms: float = 5000) -> Ar
         listen=("tcp/127.0.0.1:0",),
         rig=rig,
         robots=str(folder / "robots.yaml"),
-        limits=Limits(lateness_ms=lateness_ms),
+        limits=LimitSettings(lateness_ms=lateness_ms),
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import decode
-from fusion.model.limits import Limits
+from fusion.model.limits import LimitSettings
 from fusion.protocol.pose_messages import Markers, RobotPose, Vector
 from fusion.protocol.zone_messages import zone_key
 from fusion.server.arena_config import ArenaConfig
@@ -44,7 +44,7 @@ def settings(folder: Path, endpoint: str) -> ArenaConfig:
         listen=(endpoint,),
         rig=str(folder / "rig.yaml"),
         robots=str(folder / "robots.yaml"),
-        limits=Limits(lateness_ms=5000),
+        limits=LimitSettings(lateness_ms=5000),
         zones=zones_of({"west": pairs(0, 1), "east": pairs(2, 3)}, endpoint),
         zone="west",
     )
