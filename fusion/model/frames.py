@@ -92,12 +92,7 @@ def clock_sigma_s(error_us: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """Frames of all cameras near `t_ns`, each with its own capture time.
-
-    Attributes:
-        is_searched: whether missing robots and markers of no robot are searched for: not while other frame sets wait.
-    """
+    """Frames of all cameras near `t_ns`, each with its own capture time."""
 
     t_ns: int
     frames: tuple[CalibratedFrame, ...]
-    is_searched: bool = True

@@ -243,8 +243,7 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
     """The frames of a frame set, so that a replay fuses the same frames as the server did.
 
     Columns, one row a frame: `stamps` (F,) <i8 the `t_ns` of its `Detections`; `times` (F,) <i8 its capture time as it
-    was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds. `is_searched`: whether
-    missing robots were searched for in the frame set.
+    was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds.
     """
 
     version: int = VERSION
@@ -253,7 +252,6 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
     stamps: bytes
     times: bytes
     clock_sigmas: bytes
-    is_searched: bool = True
 
     @classmethod
     def of(cls, frame_set: FrameSet) -> "FusedFrames":
@@ -265,7 +263,6 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
             stamps=np.array([frame.stamp_ns for frame in frames], "<i8").tobytes(),
             times=np.array([frame.t_ns for frame in frames], "<i8").tobytes(),
             clock_sigmas=np.array([frame.clock_sigma_s for frame in frames], "<f8").tobytes(),
-            is_searched=frame_set.is_searched,
         )
 
     def check(self) -> None:

@@ -237,7 +237,7 @@ def recorded_frame_sets(
         if has_begun:
             if n_missing:
                 faults["frames that the server used and the recording does not hold"] += n_missing
-            yield FrameSet(fused.t_ns, frames, fused.is_searched)
+            yield FrameSet(fused.t_ns, frames)
 
 
 def _with_their_frames(recording: ArenaRecording) -> Iterator[tuple[FusedFrames, "Held"]]:

@@ -2,8 +2,8 @@
 """Gathers the frames of free-running cameras into frame sets. Time comes from the data and the caller, not a clock."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 from fusion.model.frames import CalibratedFrame, FrameSet
@@ -115,7 +115,7 @@ class FrameSynchronizer:
         if self._end_ns is None or not self.period_ns or not self._waiting:
             return None, 0
         opened = self._gather(self._end_ns, self.period_ns)
-        return (opened if opened.frames else None), sum(self._missing_cameras(self._end_ns))
+        return (opened if opened.frames else None), self._count_missing(self._end_ns)
 
     def finish(self) -> list[FrameSet]:
         """The frame sets of all remaining frames, at the end of a recording."""
@@ -199,39 +199,18 @@ class FrameSynchronizer:
         """Whether the wait limit is reached, or all live cameras have delivered to a set that has begun."""
         has_begun = self.period_ns is not None and now_ns >= end_ns - self.period_ns
         is_complete = has_begun and any(self._is_live(c) for c in self._cameras.values())
-        return (is_complete and not any(self._missing_cameras(end_ns))) or now_ns >= end_ns + self.lateness_ns
+        return (is_complete and not self._count_missing(end_ns)) or now_ns >= end_ns + self.lateness_ns
 
     def _note(self, name: str, camera: _CameraRate) -> None:
-        """Whether a camera is missing in the open set, after its times changed."""
+        """Note whether a camera is missing in the open set, after its times changed."""
         if camera.is_missing(self._missing_end_ns):
             self._missing[name] = camera
         else:
             self._missing.pop(name, None)
 
-    def _missing_cameras(self, end_ns: int) -> Iterator[bool]:
-        """True for each live camera that has not delivered a frame that is expected before `end_ns`."""
+    def _count_missing(self, end_ns: int) -> int:
+        """How many live cameras have not delivered a frame that is expected before `end_ns`."""
         if end_ns != self._missing_end_ns:
             self._missing_end_ns = end_ns
             self._missing = {name: c for name, c in self._cameras.items() if c.is_missing(end_ns)}
-        return (True for camera in self._missing.values() if self._is_live(camera))
-
-
-MAX_UNSEARCHED_NS = 1_000_000_000  # a server that always lags searches for missing robots once a second
-
-
-class SearchTurns:
-    """Missing robots are searched for in frame sets behind which no others wait.
-
-    A search may last as long as many frame sets. Those that wait are tracked without one first, so that robots that
-    were just found are not lost.
-    """
-
-    def __init__(self) -> None:
-        self._last_ns = 0  # time of the last frame set with a search
-
-    def decide(self, frame_set: FrameSet, is_late: bool) -> FrameSet:
-        """The next frame set, with or without a search; `is_late`: whether others wait."""
-        is_searched = not is_late or abs(frame_set.t_ns - self._last_ns) > MAX_UNSEARCHED_NS
-        if is_searched:
-            self._last_ns = frame_set.t_ns
-        return replace(frame_set, is_searched=is_searched)
+        return sum(map(self._is_live, self._missing.values()))

@@ -18,7 +18,7 @@ from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import Robots, RobotsRequest
 from fusion.server.arena_config import ArenaConfig
-from fusion.server.frame_synchronizer import FrameSynchronizer, SearchTurns
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server_statistics import PipelineStatus
 from fusion.server.storage.active_rig import ActiveRig, renamed
 from fusion.server.storage.active_robots import ActiveRobots
@@ -55,7 +55,6 @@ class TrackingPipeline:
         self.synchronizer: FrameSynchronizer
         self.early: AssociatedFrames | None = None  # of the open frame set
         self._is_wand_recorded = False
-        self.searches = SearchTurns()
         self._judging: Executor | None = None
         self._start(self.cameras)
         self.active_rig.load(lambda rig: self._start(rig.placed()))

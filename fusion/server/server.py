@@ -211,10 +211,8 @@ class Server:
 
     def _fuse(self, now_ns: int, is_backlogged: bool) -> None:
         """Track the frame sets that are due; while frames of the next one are missing, associate the others."""
-        frame_sets = self._synchronize(now_ns, is_backlogged)
-        for k, frame_set in enumerate(frame_sets):
-            is_late = k + 1 < len(frame_sets) or (is_backlogged and self._lags(now_ns))
-            self._track(self.pipeline.searches.decide(frame_set, is_late))
+        for frame_set in self._synchronize(now_ns, is_backlogged):
+            self._track(frame_set)
         if not is_backlogged:
             self.pipeline.associate_early()
 
@@ -223,11 +221,6 @@ class Server:
         if is_backlogged:
             now_ns = max(self.transport.received_ns, now_ns - MAX_LAG_NS)
         return self.pipeline.synchronizer.take(now_ns)
-
-    def _lags(self, now_ns: int) -> bool:
-        """Whether messages wait for longer than a frame set lasts."""
-        period_ns = self.pipeline.synchronizer.period_ns
-        return period_ns is not None and now_ns - self.transport.received_ns > period_ns
 
     def _track(self, frame_set: FrameSet) -> None:
         """Track and publish. A frame set without a solution costs the tracks, not the server."""

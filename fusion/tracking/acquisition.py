@@ -54,12 +54,6 @@ class Acquired:
     reasons: dict[int, str]
     crowded: Index
 
-    @classmethod
-    def none(cls, table: TrackTable, assignments: Assignments) -> "Acquired":
-        """Nothing, without a search."""
-        rows = np.empty(0, np.intp)
-        return cls(rows, table.states.select(rows), rows, assignments, [], {}, rows)
-
 
 class Acquisition:
     """Acquires robots of a track table.
@@ -70,12 +64,10 @@ class Acquisition:
 
     Attributes:
         search: finds markers among unassigned detections.
-        n_unsearched: how many frame sets were not searched.
     """
 
     def __init__(self, cameras: CameraArray, estimator: Estimator) -> None:
         self._cameras, self._estimator = cameras, estimator
-        self.n_unsearched = 0
         self._turn = 0  # row of the first constellation to search for, if there are too many
         self.search, self._weak = MarkerSearch(cameras), WeakFits()
 
@@ -168,8 +160,8 @@ class Acquisition:
         self._turn = identified.turn
         if self._turn == turn and len(rows) < len(missing):
             self._turn = int(rows[-1]) + 1
-        n_searched, t_ns = self.search.n_frame_sets, table.t_ns or 0
-        confirmed = self._weak.confirm(identified.weak, t_ns, n_searched, n_searched + self.n_unsearched)
+        n_frame_sets, t_ns = self.search.n_frame_sets, table.t_ns or 0
+        confirmed = self._weak.confirm(identified.weak, t_ns, n_frame_sets)
         found = [*identified.fits, *confirmed]
         acquired = {k for fits in found for k in fits.robot.tolist()}
         left = [k for k in missing.tolist() if k not in acquired]

@@ -293,7 +293,7 @@ def _best_rivals(mappings: Mappings, chi2: Array) -> tuple[Array, Index]:
 
 
 CONFIRMATIONS = 5  # frame sets in which a weak fit must be at one place
-MAX_BETWEEN = 5  # searched frame sets from one to the next of these
+MAX_BETWEEN = 5  # frame sets from one to the next of these
 SAME_PLACE_M = 0.15  # of a robot in two successive frame sets
 SLACK_M_S = 0.15  # of a velocity, beyond its covariance
 
@@ -304,8 +304,7 @@ class _Sighting:
 
     Attributes:
         p: (3,) its position.
-        t_ns: when it was.
-        search, frame_set: the numbers of the search and of the frame set; not all frame sets are searched.
+        t_ns, frame_set: when it was.
         count: how many were at one place so far.
         drift: (3,) how far these moved, less what their velocities say.
         since_ns: the time of the first of these.
@@ -314,7 +313,6 @@ class _Sighting:
 
     p: Array
     t_ns: int
-    search: int
     frame_set: int
     count: int
     drift: Array
@@ -322,17 +320,17 @@ class _Sighting:
     cov_v: Array
 
     @classmethod
-    def of(cls, fit: States, t_ns: int, search: int, frame_set: int, last: "_Sighting | None") -> "_Sighting":
+    def of(cls, fit: States, t_ns: int, frame_set: int, last: "_Sighting | None") -> "_Sighting":
         """The sighting of one fit, after the last one."""
         p, v, cov_v = fit.p[0], fit.v[0], fit.P[0, VELOCITY, VELOCITY]
-        first = cls(p, t_ns, search, frame_set, 1, np.zeros(3), t_ns, cov_v)
+        first = cls(p, t_ns, frame_set, 1, np.zeros(3), t_ns, cov_v)
         if last is None:
             return first
         moved = p - last.p
         if np.linalg.norm(moved) > SAME_PLACE_M * max(1, frame_set - last.frame_set):
             return first
         drift = last.drift + moved - (t_ns - last.t_ns) * 1e-9 * v
-        return cls(p, t_ns, search, frame_set, last.count + 1, drift, last.since_ns, cov_v)
+        return cls(p, t_ns, frame_set, last.count + 1, drift, last.since_ns, cov_v)
 
     @property
     def is_confirmed(self) -> bool:
@@ -349,19 +347,19 @@ class WeakFits:
     def __init__(self) -> None:
         self._last: dict[int, _Sighting] = {}
 
-    def confirm(self, weak: list[RefinedFits], t_ns: int, search: int, frame_set: int) -> list[RefinedFits]:
+    def confirm(self, weak: list[RefinedFits], t_ns: int, frame_set: int) -> list[RefinedFits]:
         """Of the weak fits of a frame set, those that were at one place in `CONFIRMATIONS`, and nowhere else between.
 
         Args:
             weak: at most one of each robot.
             t_ns: time of the frame set.
-            search, frame_set: its numbers, see `_Sighting`.
+            frame_set: its number.
         """
-        self._last = {k: seen for k, seen in self._last.items() if search - seen.search <= MAX_BETWEEN}
+        self._last = {k: seen for k, seen in self._last.items() if frame_set - seen.frame_set <= MAX_BETWEEN}
         for fits in weak:
             for k, robot in enumerate(fits.robot.tolist()):
                 state, last = fits.states.select(np.array([k])), self._last.get(robot)
-                self._last[robot] = _Sighting.of(state, t_ns, search, frame_set, last)
+                self._last[robot] = _Sighting.of(state, t_ns, frame_set, last)
         return [
             fits.select(np.array([self._last[k].is_confirmed for k in fits.robot.tolist()], bool))
             for fits in weak

@@ -52,7 +52,6 @@ class Update:
         associated: the assignments before those were dropped that do not fit.
         summary: of the assignments.
         poses: by row of the robot; acquisition does not change these.
-        is_searched: see `FrameSet`.
     """
 
     t_ns: int
@@ -63,7 +62,6 @@ class Update:
     associated: Assignments
     summary: ObservationSummary
     poses: dict[int, RobotPose]
-    is_searched: bool
 
 
 class Tracker:
@@ -174,7 +172,6 @@ class Tracker:
             self.geometry.note(summary.mean_px2)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
-        searched = frame_set.is_searched
         return Update(
             t_ns,
             associated.prediction,
@@ -184,7 +181,6 @@ class Tracker:
             all_assigned,
             summary,
             poses,
-            searched,
         )
 
     def finish(self, update: Update) -> TrackingResult:
@@ -274,9 +270,6 @@ class Tracker:
 
     def _acquire(self, update: Update) -> tuple[Update, Acquired]:
         """Acquire missing robots; returns the update with their assignments."""
-        if not update.is_searched:
-            self.acquisition.n_unsearched += 1
-            return update, Acquired.none(self.table, update.assignments)
         missing = np.flatnonzero(~update.tracked & self.table.searched & (not self.acquires_none))
         histories = partial(self.unlabeled.histories, update.t_ns)
         found = self.acquisition.acquire(
@@ -303,8 +296,6 @@ class Tracker:
     def _track_unlabeled(self, update: Update, markers: list[Marker]) -> UnlabeledMarkers:
         """Track the remaining markers, and those that only one camera sees."""
         seen = self.unlabeled.track(update.t_ns, update.detections, markers)
-        if not update.is_searched:
-            return seen
         used = np.concatenate([update.assignments.detection, seen.detections])
         rows = self.single_view.confirm(update.t_ns, update.detections, used)
         self.acquisition.search.is_due = len(rows) > 0

@@ -26,7 +26,7 @@ from fusion.model.frames import FrameSet
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import Latency, RobotPose, TrackingState
 from fusion.rig_graph.rig_monitor import JudgeProcess
-from fusion.server.frame_synchronizer import FrameSynchronizer, SearchTurns
+from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Ingest
 from fusion.server.server import MAX_LAG_NS, collecting_between_frame_sets
 from fusion.server.server_statistics import PipelineStatus, ServerStatistics
@@ -128,7 +128,6 @@ class Queue:
         self._done_ns = Series(room)  # processor time at the end of each frame set
         self._warm = False
         self._early: AssociatedFrames | None = None
-        self._searches = SearchTurns()
 
     def step(self, message: Detections, arrival_ns: int) -> bool:
         """Process a message; return whether that completed a frame set. The first `START_S` seconds do not count."""
@@ -162,9 +161,7 @@ class Queue:
     def _take(self, data: bytes, key: str, arrival_ns: int) -> bool:
         self._spend(lambda: self._add(data, key, arrival_ns))
         frame_sets = self._spend(lambda: self.synchronizer.take(arrival_ns))
-        for k, closed in enumerate(frame_sets):
-            is_late = k + 1 < len(frame_sets) or self.free_ns > arrival_ns + 1e9 / self.load.hz
-            frame_set = self._searches.decide(closed, is_late)
+        for frame_set in frame_sets:
             update = self._spend(lambda frame_set=frame_set: self._update(frame_set))
             first = list(update.poses.values())
             self._spend(lambda first=first: self._encode(first))
