@@ -39,7 +39,7 @@ class Ruler:
         server.scene.on_click()(lambda click: self.select(click.ray_origin, click.ray_direction))
 
     def select(self, origin: ArrayLike, direction: ArrayLike) -> None:
-        """Select the marker nearest to a ray (world); a third one begins anew."""
+        """Select the marker nearest to a ray (world); a third one starts another distance."""
         k = nearest_to_ray(self._markers, origin, direction) if self._active else None
         if k is not None:
             self._ends = [*self._ends, self._markers[k]] if len(self._ends) < 2 else [self._markers[k]]

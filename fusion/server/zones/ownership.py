@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 
 from fusion.protocol.zone_messages import Claim, ZoneReport
 
-NOBODY = Claim(0, "", 0)
+UNCLAIMED = Claim(0, "", 0)
 HANDOVER_NS = 50_000_000  # from a handover's message to the new owner's first pose, on a busy machine
 
 
@@ -54,7 +54,7 @@ class Ownership:
     def receive(self, zone: str, report: ZoneReport) -> None:
         """Take the claims of another zone's report; a late one can't take any back."""
         for robot, claim in report.claims.items():
-            self.claims[robot] = max(claim, self.claims.get(robot, NOBODY))
+            self.claims[robot] = max(claim, self._claim(robot))
         last = self._reports.get(zone)
         if zone in self._alive and (last is None or report.t_ns > last.t_ns):
             self._reports[zone] = report
@@ -79,7 +79,7 @@ class Ownership:
         return [zone for zone, report in self._reports.items() if robot in report.follows]
 
     def step(self, t_ns: int, tracked: Iterable[str], lost: Iterable[str], better: Mapping[str, str]) -> bool:
-        """Claim robots that nobody owns, and hand over own ones, after a frame set.
+        """Claim robots that no zone owns, and hand over own ones, after a frame set.
 
         Args:
             t_ns: time of the frame set.
@@ -123,13 +123,13 @@ class Ownership:
             self.claims[after] = max(claim, self._claim(after))
 
     def _claim_free(self, robots: Iterable[str]) -> None:
-        """Claim those of some robots that nobody owns, if every living zone has said what it owns."""
+        """Claim those of some robots that no zone owns, if every living zone has said what it owns."""
         for robot in robots if self._alive <= self._reports.keys() else ():
             if self._is_free(robot):
                 self.claims[robot] = Claim(self._claim(robot).epoch + 1, self._zone, self._t_ns)
 
     def _claim(self, robot: str) -> Claim:
-        return self.claims.get(robot, NOBODY)
+        return self.claims.get(robot, UNCLAIMED)
 
     def _is_free(self, robot: str) -> bool:
         """Whether no other living zone owns a robot and sees it."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Robots with codes: identical ones are told apart, and a single roundel has a heading."""
+"""Robots with codes: identical ones are distinguished, and a single roundel has a heading."""
 
 from collections.abc import Iterator
 
@@ -65,7 +65,7 @@ def test_identical_robots_of_one_coded_roundel_are_tracked_with_their_headings()
 
 @pytest.mark.parametrize("until", [0.3, 0.45])
 def test_robots_that_are_exchanged_keep_their_names(until: float):
-    """At once, or hidden meanwhile: each is tracked where the other was within 0.1 s, and no pose is 5 cm wrong.
+    """At once, or while they are hidden: each is tracked where the other was within 0.1 s, and no pose is 5 cm wrong.
 
     Frame sets around the exchange have frames of both sides of it.
     """
