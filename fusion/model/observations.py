@@ -220,6 +220,11 @@ class DetectionTable(Columns):
         return self.exposures.camera[self.frame]
 
     @property
+    def variance_px2(self) -> Array:
+        """(N,) mean variance of the two coordinates of a centre, px^2."""
+        return (self.cov[0, 0] + self.cov[1, 1]) / 2
+
+    @property
     def tau(self) -> Array:
         """(N,) capture time minus the time of the frame set, seconds."""
         return self.exposures.tau[self.frame] + self.delay
@@ -385,8 +390,7 @@ class MatchedObservations(Columns):
     def misfit(self, residuals_px: Array) -> Array:
         """(N,) squares of residuals (2, N) in standard deviations, including `SLACK_PX`; infinite where these are NaN:
         the disc is not visible."""
-        cov = self.detections.cov
-        d2 = np.sum(residuals_px**2, 0) / ((cov[0, 0] + cov[1, 1]) / 2 + SLACK_PX**2)
+        d2 = np.sum(residuals_px**2, 0) / (self.detections.variance_px2 + SLACK_PX**2)
         return np.nan_to_num(d2, nan=np.inf)
 
 

@@ -332,14 +332,14 @@ def _claim_m(window: Window) -> float:
     seen, body = window.observations.detections, window.observations.discs.body
     range_m = np.linalg.norm(window.states.p[body] - window.T[window.camera, :3, 3], axis=1)
     pixel = np.sqrt(np.abs(seen.scale[0, 0] * seen.scale[1, 1] - seen.scale[0, 1] * seen.scale[1, 0]))
-    return float(np.sqrt(np.mean((seen.cov[0, 0] + seen.cov[1, 1]) / 2 * (range_m / pixel) ** 2)))
+    return float(np.sqrt(np.mean(seen.variance_px2 * (range_m / pixel) ** 2)))
 
 
 def _sigma_px(window: Window, best: Fit, covariance: Array, k: int) -> float:
     """RMS standard deviation, pixels, of the images of a camera's markers by the covariance (6, 6) of its pose."""
     mine = np.flatnonzero(window.camera == k)
-    B, cov = best.by_camera[mine, :, :6], window.observations.detections.cov[:, :, mine]
-    variance = np.einsum("nai,ij,naj->n", B, covariance, B) / 2 * (cov[0, 0] + cov[1, 1]) / 2
+    B, claimed_px2 = best.by_camera[mine, :, :6], window.observations.detections.variance_px2[mine]
+    variance = np.einsum("nai,ij,naj->n", B, covariance, B) / 2 * claimed_px2
     return float(np.sqrt(variance.mean()))
 
 

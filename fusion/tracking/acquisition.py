@@ -185,8 +185,7 @@ class Acquisition:
 
 def _usual_misfit(table: TrackTable, detections: DetectionTable, assignments: Assignments) -> float:
     """The median of the mean squared residuals of tracked robots, in standard deviations; 0 without any."""
-    cov = detections.cov[:, :, assignments.detection]
-    d2 = assignments.squared_px / ((cov[0, 0] + cov[1, 1]) / 2 + SLACK_PX**2)
+    d2 = assignments.squared_px / (detections.variance_px2[assignments.detection] + SLACK_PX**2)
     robot = table.markers.robot[assignments.marker[np.isfinite(d2)]]
     means = mean_by_body(d2[np.isfinite(d2)], robot, len(table.robots))[np.unique(robot)]
     return float(np.median(means)) if len(means) else 0.0

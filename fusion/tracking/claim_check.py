@@ -193,7 +193,7 @@ class ClaimCheck:
         centre = cameras.views(states, seen.exposures, observations.discs).centre
         weight = np.abs(_determinant(observations.whiten))  # of squares in the image plane
         rig_px2 = cameras.error_px[seen.camera] ** 2
-        return centre[2] / np.sqrt(weight), 2 * rig_px2 / (seen.cov[0, 0] + seen.cov[1, 1])
+        return centre[2] / np.sqrt(weight), rig_px2 / seen.variance_px2
 
 
 def _determinant(matrices: Array) -> Array:

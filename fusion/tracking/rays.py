@@ -72,7 +72,7 @@ def rays_of(cameras: CameraArray, detections: DetectionTable, rows: Index, diame
     """The rays of some detections; see `find_markers`."""
     seen = detections.select(rows)
     camera, d = seen.camera, cameras.rays(seen.camera, seen.xy)
-    noise = np.sqrt((seen.cov[0, 0] + seen.cov[1, 1]) / 2 + RAY_SLACK_PX**2)
+    noise = np.sqrt(seen.variance_px2 + RAY_SLACK_PX**2)
     focal = cameras.focal[camera]
     depth = 1 / np.sqrt(1 + seen.xy[0] ** 2 + seen.xy[1] ** 2)  # per metre of range
     size = seen.axes_px[0] * depth / focal

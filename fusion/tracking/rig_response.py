@@ -98,14 +98,13 @@ class RigResponse:
         """Update by the equations (N, 2, 13) and weights (N,) of observations, and by the information (R, 12, 12) of
         the predictions and the transition to them; robots without observations are predicted."""
         seen, (information, motion) = observations.detections, predicted
-        camera = seen.exposures.camera
-        rig_px2 = self._cameras.error_px[camera[seen.frame]] ** 2 + added_px2
+        rig_px2 = self._cameras.error_px[seen.camera] ** 2 + added_px2
         self.responses, self.counted = _core.respond(
             self._cameras.frame_poses(states, seen.exposures),
-            camera,
+            seen.exposures.camera,
             len(self._cameras.names),
             *linearized,
-            2 * rig_px2 / (seen.cov[0, 0] + seen.cov[1, 1]),
+            rig_px2 / seen.variance_px2,
             seen.frame,
             observations.discs.body,
             seen.xy,

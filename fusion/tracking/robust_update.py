@@ -115,8 +115,8 @@ class RobustUpdate:
         fitted = self._estimator.fit(prediction, observations)
         states, residuals = fitted.states, fitted.residuals
         assignments = assignments.with_residuals(residuals)
-        body, n, cov = observations.discs.body, len(prediction.states), observations.detections.cov
-        squared = np.nan_to_num(np.sum(residuals**2, 0) * 2 / (cov[0, 0] + cov[1, 1]), nan=np.inf)
+        body, n = observations.discs.body, len(prediction.states)
+        squared = np.nan_to_num(np.sum(residuals**2, 0) / observations.detections.variance_px2, nan=np.inf)
         cost = costs_of(squared, body, states.minus(prediction.states), prediction.information)
         contradicted = mean_by_body(observations.misfit(residuals) > MAX_CHI2, body, n) > CONTRADICTED
         rows, equations, weights = np.flatnonzero(contradicted), fitted.equations, fitted.weights
@@ -154,8 +154,7 @@ class RobustUpdate:
 
     def _with_noise(self, fitted: RobustFit, assignments: Assignments, last_px2: float) -> RobustFit:
         """The fit with as much noise as makes it usual, not much less than the frame set before had."""
-        cov = fitted.detections.cov
-        self.added_px2 = max(last_px2 / 2, float((cov[0, 0] + cov[1, 1]).mean() / 2))
+        self.added_px2 = max(last_px2 / 2, float(fitted.detections.variance_px2.mean()))
         while self._is_unusual(
             again := self._fit(fitted.prediction, self.noisy(fitted.detections), assignments)
         ):
@@ -226,8 +225,7 @@ def jointly_compatible(
     """
     observations = estimator.with_time_errors(prediction.states, observations)
     A, nu = estimator.innovations(prediction.states, observations)
-    cov = observations.detections.cov
-    variance = (cov[0, 0] + cov[1, 1]) / 2
+    variance = observations.detections.variance_px2
     share = np.sqrt(variance / (variance + slack_px**2))[:, None]
     A, nu = A.reshape(-1, 2, 12) * share[:, :, None], nu.reshape(-1, 2) * share
     order = np.argsort(observations.discs.body, kind="stable")

@@ -104,7 +104,7 @@ class SingleViewTracker:
         ray = mean / np.linalg.norm(mean, axis=1, keepdims=True)
         range2 = np.einsum("ni,ni->n", mean, mean)
         along = range2 * (AXIS_SIGMA_PX / seen.axes_px[0]) ** 2
-        across = range2 * (seen.cov[0, 0] + seen.cov[1, 1]) / 2 / self._cameras.focal[seen.camera] ** 2
+        across = range2 * seen.variance_px2 / self._cameras.focal[seen.camera] ** 2
         rays = ray[:, :, None] * ray[:, None]
         noise = along[:, None, None] * rays + across[:, None, None] * (np.eye(3) - rays)
         covariance = noise + np.einsum("nki,nkj->nij", off, off) / positions.shape[1]

@@ -267,5 +267,4 @@ def _whitened_shifts(observations: MatchedObservations) -> Array:
 
 def _variance_px2(observations: MatchedObservations) -> Array:
     """(N,) mean variance of a whitened coordinate, px^2."""
-    cov = observations.detections.cov
-    return (cov[0, 0] + cov[1, 1]) / 2 + SLACK_PX**2
+    return observations.detections.variance_px2 + SLACK_PX**2
