@@ -19,7 +19,6 @@ PARAMETERS = (*POSE, *OFFSET, LENS[0])  # the same, as `calib.rig.camera` number
 OF_IMAGE = np.arange(ERRORS) != 6  # all but the clock's displace the image of a point at rest
 MAX_JOINT = 16  # cameras whose covariances between each other fit into a rig's message: 16,384 numbers
 DIGITS = 6  # of a number in the file
-REGULAR = 1e-10  # of a correlation: a covariance of `DIGITS` digits may be singular
 # Error in the image of a rig that states no covariance: 0.01 to 0.06 px after a wand calibration with carefully
 # calibrated lenses (`python -m tests.benchmarks.calibration`).
 USUAL_PX = 0.05
@@ -53,9 +52,11 @@ def with_errors(cameras: Mapping[str, Camera], covariance: Array) -> dict[str, C
     them beyond `MAX_JOINT` cameras."""
     n = len(cameras)
     if n > MAX_JOINT:
-        full = np.array([_factor(block) for block in _own_blocks(covariance)]).reshape(n * ERRORS, ERRORS)
+        full = np.array([covariance_factor(block) for block in _own_blocks(covariance)]).reshape(
+            n * ERRORS, ERRORS
+        )
     else:
-        full = _factor(covariance)
+        full = covariance_factor(covariance)
     stated = {}
     for k, (name, camera) in enumerate(cameras.items()):
         rows = full[ERRORS * k : ERRORS * (k + 1)]
@@ -84,12 +85,13 @@ def as_pose_errors(lens: Lens, points: Array, parameters: tuple[int, ...]) -> Ar
     return found
 
 
-def _factor(covariance: Array) -> Array:
-    """(n, n) lower triangular L with L L^T the covariance (n, n), which may be singular."""
+def covariance_factor(covariance: Array) -> Array:
+    """(n, n) lower triangular L with L L^T the covariance (n, n), which may be singular: what rounding makes negative
+    counts as zero."""
     scale = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny ** 0.5))
-    correlation = covariance / np.outer(scale, scale)
-    regular = correlation + REGULAR * np.eye(len(scale))
-    return scale[:, None] * np.asarray(np.linalg.cholesky(regular), float)
+    variances, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
+    root = directions * np.sqrt(np.maximum(variances, 0.0))
+    return scale[:, None] * np.asarray(np.linalg.qr(root.T, mode="r"), float).T
 
 
 def _own_blocks(covariance: Array) -> Array:

@@ -18,15 +18,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.rig.camera_errors import ERRORS
+from calib.rig.camera_errors import ERRORS, covariance_factor
 from camera_node.foundation.arrays import Array, Index
 from fusion import _core
 from fusion.model.observations import MatchedObservations
 from fusion.model.states import States, Transition
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.robust_update import RobustFit
-
-REGULAR = 1e-12  # share of a variance that keeps the factor of a singular covariance regular
 
 
 class RigResponse:
@@ -133,7 +131,5 @@ class RigResponse:
             covariance = self._cameras.covariance.copy()
             turns = np.flatnonzero(np.arange(len(covariance)) % ERRORS < 2)
             covariance[turns, turns] += added_px2 / self._cameras.focal[turns // ERRORS] ** 2
-            diagonal = np.diag_indices(len(covariance))
-            covariance[diagonal] += REGULAR * covariance[diagonal] + np.finfo(float).tiny ** 0.5
-            self._factor, self._factor_of = np.asarray(np.linalg.cholesky(covariance), float), key
+            self._factor, self._factor_of = covariance_factor(covariance), key
         return self._factor

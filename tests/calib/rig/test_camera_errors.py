@@ -114,3 +114,13 @@ def test_errors_of_a_lens_that_look_like_a_turn_are_that_turn():
     found = as_pose_errors(camera, points, parameters) @ np.append(turn, 1.0)
     moved = J_pose @ found[:6] + J_lens[:, :, 0] * found[7]
     assert np.sqrt(np.mean(moved**2)) < 0.01
+
+
+def test_a_covariance_that_rounding_made_indefinite_is_written():
+    """Cameras of which only differences are known: their common motion has variance 0, and rounding makes it less."""
+    n = 4
+    common = np.tile(np.eye(ERRORS), (n, 1)) / np.sqrt(n)
+    apart = np.eye(ERRORS * n) - common @ common.T
+    singular = 1e-6 * (apart - 1e-8 * common @ common.T)
+    found = error_covariance(list(with_errors(ring(), singular).values()))
+    assert found == pytest.approx(1e-6 * apart, abs=1e-11)
