@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import socket
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -49,6 +50,11 @@ PORTS = range(20_000, 30_000)  # below the ephemeral ports of Linux, macOS and W
 _reserved_ports: set[int] = set()
 PAGE_NICENESS, NICENESS = 5, 10  # of tests with a browser, and of those that only compute
 SLOW_TIMEOUT_S = 3600
+
+# Else pytest rewrites all tests in each process, and each program that a test starts compiles itself: a container that
+# sets the variable doubles the time of both.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # Examples are the same in each run, and none has a limit of wall-clock time: other tests load the machine.
 hypothesis.settings.register_profile("roundel", deadline=None, derandomize=True)
