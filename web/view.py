@@ -102,8 +102,14 @@ class View:
             self._relative.draw(state)
             for section, is_live, interval in self._sections:
                 if self._drawings % interval == 0:
-                    section.update(live if is_live else state)
+                    self._update(section, live if is_live else state)
         self._drawings += 1
+
+    def _update(self, section: PanelSection, state: ArenaState) -> None:
+        try:
+            section.update(state)
+        except Exception as error:  # of one section: the buttons of the others must follow the arena
+            self.feed.count_fault(f"{type(section).__name__}: {error!r}"[:120])
 
     def add(self, section: PanelSection, is_live: bool = False, interval: int = PANEL_INTERVAL) -> None:
         """Update further controls of the panel in one of `interval` drawings.

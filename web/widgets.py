@@ -1,18 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Controls that all tabs use: a line for outcomes, and buttons that run one action at a time."""
+"""Controls that all tabs use: a line for outcomes, buttons that run one action at a time, buttons that ask again, and
+the decision on a result."""
 
 import logging
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import viser
 
 from camera_node.foundation.errors import RoundelError
+from web.errors import WebError
 from web.html_tables import small
 
 log = logging.getLogger("web")
 GREY, PRIMARY = (58, 63, 74), None  # colours of buttons; None is the theme's primary colour
+Result = TypeVar("Result")
+# What is stored of a control and what is sent to browsers must have one order: two threads that set a property at once
+# would leave a browser with the value that the page no longer has, and that it therefore never sends again.
+_setting = threading.RLock()
 
 
 class Answer:
@@ -23,9 +29,19 @@ class Answer:
 
     def show(self, text: str, level: str = "wait") -> None:
         """Show a text in the colour of a level; an empty one hides the line."""
-        set_content(self._handle, small(text, level) if text else "")
-        if self._handle.visible != bool(text):
-            self._handle.visible = bool(text)
+        with _setting:
+            set_content(self._handle, small(text, level) if text else "")
+            set_property(self._handle, "visible", bool(text))
+
+    def show_outcome(self, name: str, act: Callable[[], str]) -> None:
+        """Run an action and show what it returns, or its error: the page must show any failure to its user."""
+        try:
+            self.show(act(), "ok")
+        except RoundelError as error:
+            self.show(str(error), "bad")
+        except Exception as error:
+            log.exception("the action %s failed", name)
+            self.show(f"this failed: {type(error).__name__}: {error}", "bad")
 
 
 class ActionButton:
@@ -56,26 +72,65 @@ class ActionButton:
         """Run the action for a browser, unless it runs already or can not act."""
         if not self._enabled or not self._running.acquire(blocking=False):
             return
-        self.client, self.handle.disabled = client, True
+        self.client = client
+        self._show_disabled()
         try:
-            self._answer.show(self._act(), "ok")
-        except RoundelError as error:
-            self._answer.show(str(error), "bad")
-        except Exception as error:  # the page must show any failure to its user
-            log.exception("the action %s failed", self.handle.label)
-            self._answer.show(f"this failed: {type(error).__name__}: {error}", "bad")
+            self._answer.show_outcome(self.handle.label, self._act)
         finally:
             self._running.release()
-            self.handle.disabled = not self._enabled
+            self._show_disabled()
 
     def show(self, enabled: bool = True, primary: bool = False, label: str = "") -> None:
         """Enable the button where it can act, and colour it where it is the operator's next step."""
         self._enabled = enabled
-        disabled = not enabled or self._running.locked()
-        for name, value in (("disabled", disabled), ("color", PRIMARY if primary else GREY)):
-            set_property(self.handle, name, value)
+        self._show_disabled()
+        set_property(self.handle, "color", PRIMARY if primary else GREY)
         if label:
             set_property(self.handle, "label", label)
+
+    def _show_disabled(self) -> None:
+        with _setting:
+            set_property(self.handle, "disabled", not self._enabled or self._running.locked())
+
+
+class ConfirmedButton(ActionButton):
+    """A button that acts with the second click of one browser on one subject, and else asks.
+
+    Args:
+        gui, label, answer, hint: as of `ActionButton`; the label begins with a verb.
+        subject: returns on what the action acts.
+        act: as of `ActionButton`.
+        consequence: what the question adds.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        label: str,
+        subject: Callable[[], str],
+        act: Callable[[], str],
+        answer: Answer,
+        consequence: str = "",
+        hint: str | None = None,
+    ) -> None:
+        super().__init__(gui, label, self._ask, answer, hint)
+        self._label, self._subject, self._confirmed, self._consequence = label, subject, act, consequence
+        self._asked: tuple[viser.ClientHandle | None, str] | None = None
+
+    def show(self, enabled: bool = True, primary: bool = False, label: str = "") -> None:
+        """As of `ActionButton`; the label says whether the next click acts."""
+        if self._asked is not None and self._asked[1] != self._subject():
+            self._asked = None
+        again = f"{self._label.split()[0]}: click again"
+        super().show(enabled, primary, again if self._asked is not None else self._label)
+
+    def _ask(self) -> str:
+        asked = self.client, self._subject()
+        if self._asked != asked:
+            self._asked = asked
+            return f"click again to {self._label.split()[0].lower()} {asked[1]}{self._consequence}"
+        self._asked = None
+        return self._confirmed()
 
 
 class LongAction:
@@ -119,7 +174,7 @@ class LongAction:
                 self._end.set()
                 return
             self._end.clear()
-            self.handle.label = self._labels[1]
+            set_property(self.handle, "label", self._labels[1])
             self._thread = threading.Thread(target=self._run, name=self._labels[0], daemon=True)
             self._thread.start()
 
@@ -139,14 +194,64 @@ class LongAction:
 
     def _run(self) -> None:
         try:
-            self._answer.show(self._act(self._end))
-        except RoundelError as error:
-            self._answer.show(str(error), "bad")
-        except Exception as error:  # the page must show any failure to its user
-            log.exception("the action %s failed", self._labels[0])
-            self._answer.show(f"this failed: {type(error).__name__}: {error}", "bad")
+            self._answer.show_outcome(self._labels[0], lambda: self._act(self._end))
         finally:
-            self.handle.label, self.handle.disabled = self._labels[0], False
+            set_property(self.handle, "label", self._labels[0])
+            set_property(self.handle, "disabled", False)
+
+
+class Decision(Generic[Result]):
+    """A result that the operators of the page accept or discard.
+
+    Args:
+        gui: where the two buttons are added.
+        noun: what it is, such as "the lens".
+        use: uses the result; returns the outcome as text.
+        forget: removes what the page shows of the result; returns what remains, or "".
+        answer: the line for the outcome.
+
+    Attributes:
+        result: that awaits the decision; None for none.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        noun: str,
+        use: Callable[[Result], str],
+        forget: Callable[[], str],
+        answer: Answer,
+    ) -> None:
+        self.result: Result | None = None
+        self._noun, self._use, self._forget = noun, use, forget
+        self._buttons = (
+            ActionButton(gui, f"Accept {noun}", self.accept, answer),
+            ActionButton(gui, f"Discard {noun}", self.discard, answer),
+        )
+
+    def accept(self) -> str:
+        """Use the result; returns the outcome. Raises WebError without one, and what `use` raises."""
+        if self.result is None:
+            raise WebError(f"there is nothing to accept as {self._noun}: it was decided, or not made yet")
+        outcome = self._use(self.result)
+        self.clear()
+        return outcome
+
+    def discard(self) -> str:
+        """Forget the result."""
+        return f"discarded{self.clear()}"
+
+    def clear(self) -> str:
+        """There is no result to decide about; returns what remains."""
+        self.result = None
+        return self._forget()
+
+    def show(self, enabled: bool = True) -> None:
+        """Show the buttons while there is a result."""
+        is_ready = enabled and self.result is not None
+        for button in self._buttons:
+            set_property(button.handle, "visible", is_ready)
+            button.show(enabled=is_ready, primary=button is self._buttons[0])
 
 
 def set_content(handle: Any, text: str) -> None:
@@ -156,8 +261,9 @@ def set_content(handle: Any, text: str) -> None:
 
 def set_property(handle: Any, name: str, value: object) -> None:
     """Set a property of a control if it differs: Viser sends every assignment to all browsers."""
-    if getattr(handle, name) != value:
-        setattr(handle, name, value)
+    with _setting:
+        if getattr(handle, name) != value:
+            setattr(handle, name, value)
 
 
 def escape_markdown(text: str) -> str:

@@ -54,8 +54,8 @@ def test_the_world_is_measured_shown_and_accepted(
 
     make = lambda view: WorldPanel(view.server, subscription, files, collect_s=1.0)  # noqa: E731
     with showing(subscription.feed, make) as (view, panel):
-        with pytest.raises(WebError, match="no measurement"):
-            panel.accept()
+        with pytest.raises(WebError, match="nothing to accept"):
+            panel.decision.accept()
         panel._by.value = BY_L_FRAME
         with repeating(send, 0.1), browsing(view) as page:
             page.get_by_text("Floor and origin").click()
@@ -63,8 +63,8 @@ def test_the_world_is_measured_shown_and_accepted(
                 page.get_by_role("button", name="Measure").click()
                 page.get_by_text("accept or discard them").wait_for()
                 assert load_rig(files.rig) == rig, "nothing changes before the user accepts"
-                assert panel._change is not None
-                origin = panel._change.origin_in(rig)
+                assert panel.decision.result is not None
+                origin = panel.decision.result.origin_in(rig)
                 page.get_by_role("button", name=f"{decision} the new world").click()
                 page.get_by_text("discarded" if decision == "Discard" else "the new world is").wait_for()
         true = rig.cameras["cam0"].matrix() @ np.linalg.inv(ARENA.truth.cameras["cam0"].matrix())
@@ -73,7 +73,7 @@ def test_the_world_is_measured_shown_and_accepted(
         files.wand.write_text(dump_yaml(l_frame))
         with pytest.raises(WebError, match="not a straight wand"):
             panel.measure()
-        assert panel._change is None
+        assert panel.decision.result is None
     for name, camera in load_rig(files.rig).cameras.items():
         assert camera.matrix() == pytest.approx(ARENA.truth.cameras[name].matrix(), abs=5e-3)
 

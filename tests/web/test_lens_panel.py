@@ -59,11 +59,11 @@ def test_a_lens_is_calibrated_in_the_page(
         page.get_by_text("accept or discard it").wait_for()
         panel = settings._lens
         assert panel is not None
-        candidate = panel._candidate
+        candidate = panel.decision.result
         page.get_by_role("button", name="Discard the lens").click()
         page.get_by_text("discarded").wait_for()
         assert not files.rig.exists(), "nothing changes before the user accepts"
-        panel._candidate = candidate
+        panel.decision.result = candidate
         page.get_by_role("button", name="Accept the lens").click()
         page.get_by_text("its pose is void").wait_for()
     queryable.undeclare()

@@ -152,14 +152,14 @@ def test_a_discarded_calibration_changes_nothing(
     """The preview and the candidate's file disappear; there is nothing left to accept."""
     (view, panel), before = shown, files.rig.read_bytes()
     save_rig(ARENA.truth, files.candidate)
-    panel._candidate = load_rig(files.candidate)
+    panel.decision.result = load_rig(files.candidate)
     with browsing(view) as page:
         page.get_by_role("button", name="Discard the calibration").click()
         page.get_by_text("discarded; the recording is").wait_for()
     assert not files.candidate.exists()
     assert files.rig.read_bytes() == before
-    with pytest.raises(WebError, match="no calibration to accept"):
-        panel.accept()
+    with pytest.raises(WebError, match="nothing to accept"):
+        panel.decision.accept()
 
 
 def test_missing_files_are_found_before_the_page_opens(files: CalibrationFiles):

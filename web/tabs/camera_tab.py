@@ -28,10 +28,10 @@ from web.tables import STALE_S, tabulate_cameras
 from web.tabs.calibration_panels import CalibrationFiles
 from web.tabs.lens_panel import LensPanel
 from web.tabs.mask_editor import MaskEditor
-from web.widgets import ActionButton, Answer, set_content, set_property
+from web.widgets import ActionButton, Answer, ConfirmedButton, set_content, set_property
 
 NO_CAMERA = "no camera yet"
-FORGET, CONFIRM = "Forget the camera", "Forget: click again"
+RETURNS = "; a camera that still runs registers again when it is restarted"
 
 
 class CameraTable:
@@ -111,7 +111,6 @@ class CameraSettings:
     ) -> None:
         gui = server.gui
         self._gui, self._subscription = gui, subscription
-        self._confirmed = ""  # camera that the next click forgets
         self._shown = ""  # camera whose settings are in the fields
         self._folder = gui.add_folder("One camera")
         with self._folder:
@@ -128,7 +127,15 @@ class CameraSettings:
                 hint="least contrast of a roundel, grey levels",
             )
             answer = Answer(gui)
-            self._forget = ActionButton(gui, FORGET, self.forget, answer, "of a camera that was removed")
+            self._forget = ConfirmedButton(
+                gui,
+                "Forget the camera",
+                lambda: self._name,
+                self.forget,
+                answer,
+                RETURNS,
+                "of a camera that was removed",
+            )
             self._buttons = (
                 ActionButton(gui, "Rename the camera", self.rename, answer),
                 ActionButton(gui, "Read the settings", self.read, answer),
@@ -147,8 +154,7 @@ class CameraSettings:
             self._camera.options = names
         for button in self._buttons:
             button.show(enabled=bool(state.cameras))
-        is_asked = self._confirmed == self._name
-        self._forget.show(enabled=names != (NO_CAMERA,), label=CONFIRM if is_asked else FORGET)
+        self._forget.show(enabled=names != (NO_CAMERA,))
         if self._name in state.cameras and self._name != self._shown:
             self._shown = self._name
             show = guarded("the settings of a camera", self._show_present)
@@ -166,25 +172,19 @@ class CameraSettings:
         """Have the server rename the camera, in the rig too. Raises ConfigError, RequestError or NetworkError."""
         old, new = self._name, str(self._new_name.value).strip()
         require_name(new, "a camera")
-        change = CameraChange(camera=old, name=new, source=RequestSource.of("web"))
-        arena = self._subscription.feed.keys.arena
-        change_camera(self._subscription.session, arena, change, REQUEST_TIMEOUT_S)
+        self._change(CameraChange(camera=old, name=new, source=RequestSource.of("web")))
         self._new_name.value = ""
         return f"{old} is called {new} from now on"
 
     def forget(self) -> str:
-        """Have the server forget the camera, with the second click. Raises RequestError or NetworkError."""
+        """Have the server forget the camera. Raises RequestError or NetworkError."""
         name = self._name
-        if self._confirmed != name:
-            self._confirmed = name
-            return (
-                f"click again to forget {name}; a camera that still runs registers again when it is restarted"
-            )
-        self._confirmed = ""
-        change = CameraChange(camera=name, forget=True, source=RequestSource.of("web"))
+        self._change(CameraChange(camera=name, forget=True, source=RequestSource.of("web")))
+        return f"{name} is forgotten"
+
+    def _change(self, change: CameraChange) -> None:
         arena = self._subscription.feed.keys.arena
         change_camera(self._subscription.session, arena, change, REQUEST_TIMEOUT_S)
-        return f"{name} is forgotten"
 
     def _show_present(self, name: str) -> None:
         """Fill the fields with the settings of a camera that was selected."""

@@ -21,12 +21,11 @@ from calib.intrinsics.lens_calibration import BoardViews, CalibratedLens, Model,
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.coverage import Coverage
 from calib.rig.rig import Rig
-from web.errors import WebError
 from web.html_tables import COLOURS, MARGIN_PX, small
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
-from web.widgets import ActionButton, Answer, LongAction, set_content, set_property
+from web.widgets import Answer, Decision, LongAction, set_content
 
 BOARD = "charuco:5x7:0.035"  # of `roundel print board`
 MODELS = ("pinhole", "fisheye")
@@ -57,7 +56,6 @@ class LensPanel:
         camera: Callable[[], str],
     ) -> None:
         self._gui, self._subscription, self._files, self._camera = gui, subscription, files, camera
-        self._candidate: tuple[str, CalibratedLens] | None = None
         self._folder = gui.add_folder("Lens")
         with self._folder:
             self._state = gui.add_html("")
@@ -66,8 +64,7 @@ class LensPanel:
             self._answer = answer = Answer(gui)
             self._capture = LongAction(gui, LABELS, self._calibrate, answer)
             self._cells = gui.add_html("")
-            self._accept = ActionButton(gui, "Accept the lens", self.accept, answer)
-            self._discard = ActionButton(gui, "Discard the lens", self.discard, answer)
+            self.decision = Decision(gui, "the lens", self._use, self._forget, answer)
         self._residuals: viser.GuiImageHandle | None = None
 
     def update(self, state: ArenaState) -> None:
@@ -75,22 +72,15 @@ class LensPanel:
         name = self._camera()
         set_content(self._state, small(describe_lens(state.rig, name)))
         self._capture.show(enabled=name in state.cameras)
-        is_ready = self._candidate is not None and not self._capture.is_running
-        for handle in (self._accept.handle, self._discard.handle):
-            set_property(handle, "visible", is_ready)
-        self._accept.show(enabled=is_ready, primary=is_ready)
-        self._discard.show(enabled=is_ready)
+        self.decision.show(enabled=not self._capture.is_running)
 
-    def accept(self) -> str:
+    def _use(self, candidate: tuple[str, CalibratedLens]) -> str:
         """Write the lens into the rig, and have the server use it; the camera's pose becomes void.
 
         Raises:
-            WebError: there is none.
             CalibrationError, ConfigError: the rig can't be read or written.
         """
-        if self._candidate is None:
-            raise WebError("there is no lens to accept; calibrate it with a board first")
-        name, lens = self._candidate
+        name, lens = candidate
         provenance = {
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "command": "the page",
@@ -98,28 +88,22 @@ class LensPanel:
         }
         rig = merge_lenses(current_rig(self._subscription, self._files), {name: lens}, provenance)
         outcome = apply_rig(self._subscription, self._files, rig)
-        self._forget()
         return f"the lens of {name}: {outcome}; its pose is void: record a wand session in Calibrate"
-
-    def discard(self) -> str:
-        """Forget the lens that was calibrated."""
-        self._forget()
-        return "discarded"
 
     def close(self) -> None:
         """End a capture."""
         self._capture.close(CLOSE_S)
 
-    def _forget(self) -> None:
-        self._candidate = None
+    def _forget(self) -> str:
         set_content(self._cells, "")
         if self._residuals is not None:
             self._residuals.remove()
             self._residuals = None
+        return ""
 
     def _calibrate(self, end: threading.Event) -> str:
         """Capture views until they suffice or the user ends it; returns the figures of the lens."""
-        self._forget()
+        self.decision.clear()
         name = self._camera()
         model: Model = "fisheye" if self._model.value == "fisheye" else "pinhole"
         views = BoardViews(name, make_finder(str(self._board.value)))
@@ -131,7 +115,7 @@ class LensPanel:
         self._capture.handle.disabled = True
         self._answer.show(f"{reason}; calibrating")
         lens = replace(views.solve(model), better_model=views.compare_models(model))
-        self._candidate = name, lens
+        self.decision.result = name, lens
         self._show_residuals(name, lens)
         return summarize_lens(name, lens)
 

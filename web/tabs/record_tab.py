@@ -10,7 +10,7 @@ from pathlib import Path
 import viser
 
 from calib.rig.recording import RecordingWriter
-from camera_node.foundation.errors import ConfigError, RoundelError
+from camera_node.foundation.errors import ConfigError
 from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder
 from fusion.recordings.recording_files import (
     RecordingSummary,
@@ -25,11 +25,10 @@ from web.html_tables import Column, HtmlTable, TableRow
 from web.state.feed import ArenaState
 from web.state.recording_player import RecordingPlayer
 from web.state.subscription import Subscription
-from web.widgets import ActionButton, Answer, set_content, set_property
+from web.widgets import ActionButton, Answer, ConfirmedButton, LongAction, set_content, set_property
 
 LIST_INTERVAL = 9  # updates from one look at the folder to the next: about 3 s
 NO_RECORDING = "no recording yet"
-DELETE, CONFIRM = "Delete the recording", "Delete: click again"
 CLOSE_S = 5.0  # for a recording to be completed when the page closes
 RECORDING_COLUMNS = (
     Column("recording"),
@@ -50,67 +49,50 @@ class Recorder:
 
     def __init__(self, gui: viser.GuiApi, subscription: Subscription, folder: Path) -> None:
         self._subscription, self._folder = subscription, folder
-        self._lock, self._stop = threading.Lock(), threading.Event()
-        self._thread: threading.Thread | None = None
-        self._writer: RecordingWriter | None = None
-        self._recorder: ArenaRecorder | None = None
+        self._lock = threading.Lock()
+        self._written: tuple[RecordingWriter, ArenaRecorder] | None = None
         self._name = gui.add_text("Name", "", hint="of the file; empty for date and time")
         self._answer = Answer(gui)
-        self._button = ActionButton(gui, "Start recording", self.toggle, self._answer)
+        self._action = LongAction(gui, ("Start recording", "Stop recording"), self._record, self._answer)
 
     @property
     def written(self) -> Path | None:
         """The file that is being written; None for none."""
-        is_running = self._thread is not None and self._thread.is_alive()
-        return self._writer.path if self._writer is not None and is_running else None
-
-    def toggle(self) -> str:
-        """Start recording, or stop; returns the outcome. Raises ConfigError if the file can't be written."""
-        with self._lock:
-            if self._thread is not None and self._thread.is_alive():
-                self._stop.set()
-                self._thread.join(CLOSE_S)
-                return self._describe("recorded")
-            name = self._name.value or datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-            path = recording_path(self._folder, name)
-            self._folder.mkdir(parents=True, exist_ok=True)
-            if path.exists():
-                raise ConfigError(f"{path} exists; give another name")
-            self._stop.clear()
-            self._writer = RecordingWriter(path, overwrite=False)
-            self._writer.__enter__()
-            self._thread = threading.Thread(target=self._record, args=(self._writer,), name="recorder")
-            self._thread.start()
-            return f"recording {path}"
+        written = self._written
+        return written[0].path if written is not None else None
 
     def update(self, state: ArenaState) -> None:
         """Show the progress."""
-        is_running = self.written is not None
-        label = "Stop recording" if is_running else "Start recording"
-        self._button.show(enabled=is_running or state.server_alive, primary=is_running, label=label)
-        if is_running:
-            self._answer.show(self._describe("recording"), "warn")
+        self._action.show(enabled=state.server_alive)
+        with self._lock:  # so that the outcome is shown last
+            if self._written is not None:
+                self._answer.show(_describe("recording", *self._written), "warn")
 
     def close(self) -> None:
         """Complete the recording."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(CLOSE_S)
+        self._action.close(CLOSE_S)
 
-    def _record(self, writer: RecordingWriter) -> None:
-        arena = self._subscription.feed.keys.arena
-        self._recorder = ArenaRecorder(self._subscription.connection, arena, writer)
-        try:
-            self._recorder.run(self._stop)
-            writer.__exit__()
-        except RoundelError as error:  # the disk is full
-            self._answer.show(str(error), "bad")
+    def _record(self, end: threading.Event) -> str:
+        """Record until `end`; returns the outcome. Raises ConfigError if the file exists or can't be written."""
+        path = recording_path(self._folder, self._name.value or datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+        self._folder.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            raise ConfigError(f"{path} exists; give another name")
+        with RecordingWriter(path, overwrite=False) as writer:
+            arena = self._subscription.feed.keys.arena
+            recorder = ArenaRecorder(self._subscription.connection, arena, writer)
+            self._written = writer, recorder
+            try:
+                recorder.run(end)
+            finally:
+                with self._lock:
+                    self._written = None
+        return _describe("recorded", writer, recorder)
 
-    def _describe(self, verb: str) -> str:
-        if self._writer is None:
-            return ""
-        without = f"; {NO_ROBOTS}" if self._recorder and self._recorder.robots == frozenset() else ""
-        return f"{verb} {self._writer.path}: {sum(dict(self._writer.counts).values())} messages{without}"
+
+def _describe(verb: str, writer: RecordingWriter, recorder: ArenaRecorder) -> str:
+    without = f"; {NO_ROBOTS}" if recorder.robots == frozenset() else ""
+    return f"{verb} {writer.path}: {sum(dict(writer.counts).values())} messages{without}"
 
 
 class RecordingList:
@@ -129,7 +111,6 @@ class RecordingList:
         self._folder, self._show, self._recorder = folder, show, recorder
         self._updates = 0
         self._shown: Path | None = None
-        self._confirmed: Path | None = None  # the recording that the next click deletes
         with gui.add_folder("Recordings"):
             self._table = gui.add_html("")
             self._selected = gui.add_dropdown("Recording", [NO_RECORDING])
@@ -140,7 +121,15 @@ class RecordingList:
             self._export = ActionButton(gui, "Export poses", self.export, answer, hint)
             self._new_name = gui.add_text("New file name", "", hint="of the selected recording")
             self._rename = ActionButton(gui, "Rename the recording", self.rename, answer)
-            self._delete = ActionButton(gui, DELETE, self.delete, answer, "for good, with the second click")
+            self._delete = ConfirmedButton(
+                gui,
+                "Delete the recording",
+                lambda: str(self._selected.value),
+                self.delete,
+                answer,
+                " for good",
+                "for good, with the second click",
+            )
 
     def update(self, state: ArenaState) -> None:
         """Look at the folder every few seconds."""
@@ -148,10 +137,8 @@ class RecordingList:
             self._list()
         self._updates += 1
         is_any = self._selected.value != NO_RECORDING
-        for button in (self._replay, self._export, self._rename):
+        for button in (self._replay, self._export, self._rename, self._delete):
             button.show(enabled=is_any)
-        is_asked = is_any and self._confirmed == self._folder / str(self._selected.value)
-        self._delete.show(enabled=is_any, label=CONFIRM if is_asked else DELETE)
         self._live.show(enabled=self._shown is not None, primary=self._shown is not None)
 
     def replay(self) -> str:
@@ -181,13 +168,9 @@ class RecordingList:
         return f"{old.name} is called {new.name} from now on"
 
     def delete(self) -> str:
-        """Delete the selected recording, with the second click."""
-        path = self._path
-        if self._confirmed != path:
-            self._confirmed = path
-            return f"click again to delete {path.name} for good"
-        self._confirmed = None
-        remove_recording(self._release())
+        """Delete the selected recording."""
+        path = self._release()
+        remove_recording(path)
         self._list()
         return f"{path.name} is deleted"
 

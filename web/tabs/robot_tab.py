@@ -15,10 +15,9 @@ from fusion.protocol.pose_messages import Robots, RobotsRequest
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tables import tabulate_robots
-from web.widgets import ActionButton, Answer, set_content
+from web.widgets import ActionButton, Answer, ConfirmedButton, set_content
 
 NO_ROBOT = "no robot yet"
-CONFIRM = "Delete: click again"
 
 
 class RobotTable:
@@ -65,7 +64,6 @@ class RobotEditor:
 
     def __init__(self, gui: viser.GuiApi, subscription: Subscription, folder: Path) -> None:
         self._subscription, self._file = subscription, folder / "robots.yaml"
-        self._confirmed = ""  # robot whose deletion the next click confirms
         self._changes: list[RobotChange] = []
         with gui.add_folder("One robot", expand_by_default=False):
             self._robot = gui.add_dropdown("Robot", [NO_ROBOT])
@@ -77,7 +75,7 @@ class RobotEditor:
                 "Turn, degrees", 90.0, step=1.0, hint="of the x axis, counterclockwise seen from above"
             )
             answer = Answer(gui)
-            self._delete = ActionButton(gui, "Delete", self.delete, answer)
+            self._delete = ConfirmedButton(gui, "Delete", lambda: str(self._robot.value), self.delete, answer)
             self._others = (
                 ActionButton(gui, "Rename", self.rename, answer),
                 ActionButton(gui, "Move the pivot", self.move_pivot, answer, "the robot is acquired again"),
@@ -91,10 +89,7 @@ class RobotEditor:
         names = state.declared_robots()
         if (names or (NO_ROBOT,)) != tuple(self._robot.options):
             self._robot.options = names or (NO_ROBOT,)
-        if self._confirmed != self._robot.value:
-            self._confirmed = ""
-        self._delete.show(enabled=bool(names), label=CONFIRM if self._confirmed else "Delete")
-        for button in self._others:
+        for button in (self._delete, *self._others):
             button.show(enabled=bool(names))
         self._undo.show(enabled=bool(self._changes))
 
@@ -106,12 +101,8 @@ class RobotEditor:
         return self._note(robots, f"{old} is {new} now", RobotsRequest(rename={new: old}), new)
 
     def delete(self) -> str:
-        """Remove the robot, with the second click."""
+        """Remove the robot."""
         name = str(self._robot.value)
-        if self._confirmed != name:
-            self._confirmed = name
-            return f"click again to delete {name}"
-        self._confirmed = ""
         before = self._present(name)
         robots = self._subscription.change_robots(RobotsRequest(remove=(name,)))
         return self._note(robots, f"{name} is deleted", RobotsRequest(define={name: before}), name)

@@ -30,7 +30,7 @@ from web.scene.camera_frustums import CameraDrawing
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
-from web.widgets import ActionButton, Answer, LongAction, set_content
+from web.widgets import Answer, Decision, LongAction, set_content
 
 SOLVE_S = 600.0  # limit for `roundel calibrate wand`
 CLOSE_S = 5.0  # for the recording to be saved when the page closes
@@ -62,10 +62,8 @@ class WandSessionPanel:
             )
             self._answer = Answer(server.gui)
             self._session = LongAction(server.gui, LABELS, self._calibrate, self._answer)
-            self._accept = ActionButton(server.gui, "Accept the calibration", self.accept, self._answer)
-            self._discard = ActionButton(server.gui, "Discard the calibration", self.discard, self._answer)
+            self.decision = Decision(server.gui, "the calibration", self._use, self._forget, self._answer)
             self._cameras = server.gui.add_html("")
-        self._candidate: Rig | None = None
         self._preview = CameraDrawing(server.scene, "/candidate", PREVIEW)
         self._wand = WandDrawing(server.scene)
         self._trial: Rig | None = None
@@ -76,7 +74,8 @@ class WandSessionPanel:
             return "the wand session has ended: wait for its calibration"
         if self._session.is_running:
             return "a wand session runs: wave where the table in Calibrate says"
-        return "a new calibration is ready: decide in Calibrate whether to use it" if self._candidate else ""
+        is_ready = self.decision.result is not None
+        return "a new calibration is ready: decide in Calibrate whether to use it" if is_ready else ""
 
     def update(self, state: ArenaState) -> None:
         """Enable the button while cameras send, and colour it while it is the next step."""
@@ -85,48 +84,32 @@ class WandSessionPanel:
         names = (ALL, *sorted(known.keys() & state.cameras.keys()))
         if names != tuple(self._which.options) and not self._session.is_running:
             self._which.options = names
-        is_next = step == "calibrate" and self._candidate is None
+        is_next = step == "calibrate" and self.decision.result is None
         self._session.show(enabled=step != "cameras", primary=is_next)
-        is_ready = self._candidate is not None and not self._session.is_running
-        self._accept.show(enabled=is_ready, primary=is_ready)
-        self._discard.show(enabled=is_ready)
+        self.decision.show(enabled=not self._session.is_running)
 
-    def accept(self) -> str:
-        """Write the calibrated rig and have the server use it; returns the outcome.
-
-        Raises:
-            WebError: there is none.
-            CalibrationError, ConfigError: the file can't be written.
-        """
-        candidate = self._candidate
-        if candidate is None:
-            raise WebError("there is no calibration to accept; record a wand first")
+    def _use(self, candidate: Rig) -> str:
+        """Write the calibrated rig and have the server use it; raises as `apply_rig`."""
         outcome = apply_rig(self._subscription, self._files, candidate)
-        self._forget()
         return f"{describe_calibration(candidate.calibration)}; {outcome}"
 
-    def discard(self) -> str:
-        """Forget the calibrated rig; the recording stays."""
-        self._forget()
-        return f"discarded; the recording is {wand_recording_path(self._files.rig)}"
-
-    def _forget(self) -> None:
-        self._candidate = None
+    def _forget(self) -> str:
         set_content(self._cameras, "")  # its advice is for the session that is over
         self._preview.draw(None)
         self._files.candidate.unlink(missing_ok=True)
+        return f"; the recording is {wand_recording_path(self._files.rig)}"
 
     def close(self) -> None:
         """End the session and save its recording, without calibrating."""
         self._session.close(CLOSE_S)
 
     def _calibrate(self, end: threading.Event) -> str:
-        self._forget()
+        self.decision.clear()
         try:
             return self._record_and_calibrate(end, str(self._which.value))
         finally:
             self._wand.clear()
-            if self._candidate is None:  # the session failed: the trials' poses in the scene are void
+            if self.decision.result is None:  # the session failed: the trials' poses in the scene are void
                 self._preview.draw(None)
 
     def _record_and_calibrate(self, end: threading.Event, only: str) -> str:
@@ -151,7 +134,7 @@ class WandSessionPanel:
         else:
             recalibrate_one(recording, files, before, only)
         candidate = load_rig(files.candidate)
-        self._candidate = candidate
+        self.decision.result = candidate
         self._preview.draw(candidate)
         text = (
             describe_calibration(candidate.calibration)

@@ -19,11 +19,12 @@ from web.scene.surroundings import WorldPreview
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
-from web.widgets import ActionButton, Answer
+from web.widgets import ActionButton, Answer, Decision
 
 COLLECT_S = 3.0
 STANDING, L_FRAME = "wand, upright at the origin", "L-frame, flat on the floor"
 L_FILE = "l.yaml"  # beside the wand's file; the example of the package unless it exists
+CHANGED = "the calibration was changed since, by another page or program: measure again"
 MEASURE_HINT = "detects the roundels for 3 s; nothing moves until you accept"
 
 
@@ -38,8 +39,7 @@ class WorldPanel:
         collect_s: float = COLLECT_S,
     ) -> None:
         self._subscription, self._files, self._collect_s = subscription, files, collect_s
-        self._before: Rig | None = None
-        self._change: WorldChange | None = None
+        self._before: Rig | None = None  # in which the new world was measured
         gui = server.gui
         with gui.add_folder("Floor and origin", expand_by_default=False):
             self._by = gui.add_dropdown("By", (STANDING, L_FRAME))
@@ -51,22 +51,21 @@ class WorldPanel:
                 step=0.001,
                 hint="of the standing wand: height of its centre above the floor",
             )
-            answer = Answer(gui)
+            self._answer = answer = Answer(gui)
             self._measure = ActionButton(gui, "Measure", self.measure, answer, MEASURE_HINT)
-            self._accept = ActionButton(gui, "Accept the new world", self.accept, answer)
-            self._discard = ActionButton(gui, "Discard the new world", self.discard, answer)
+            self.decision = Decision(gui, "the new world", self._use, self._forget, answer)
         self._preview = WorldPreview(server.scene)
 
     def update(self, state: ArenaState) -> None:
         """Enable the buttons that can act; a rig that changed since the measurement voids it."""
-        if self._change is not None and state.rig is not None and state.rig is not self._before:
-            self._forget()
+        is_ready = self.decision.result is not None
+        if is_ready and state.rig is not None and state.rig is not self._before:
+            self.decision.clear()
+            self._answer.show(CHANGED, "warn")
         placed = state.rig is not None and bool(state.rig.placed())
-        is_ready = self._change is not None
         is_next = next_step(state) == "floor" and not is_ready
         self._measure.show(enabled=placed and bool(state.cameras), primary=is_next)
-        self._accept.show(enabled=is_ready, primary=is_ready)
-        self._discard.show(enabled=is_ready)
+        self.decision.show()
 
     def measure(self) -> str:
         """Measure the new world, and show its axes and floor in the present one.
@@ -89,34 +88,26 @@ class WorldPanel:
         change = align_to_roundels(
             rig, name_markers(body), collected.messages, foot_m, WAND if standing else FRAME
         )
-        self._before, self._change = rig, change
+        self._before, self.decision.result = rig, change
         self._preview.draw(change.origin_in(rig))
         missed = f"; not used: roundel {', '.join(change.missing)}" if change.missing else ""
         worst = 1e3 * max(change.distances.values(), default=0.0)
         fit = f"; roundels within {worst:.1f} mm of their places" if change.distances else ""
         return f"the new axes and floor are in the scene{fit}{missed}: accept or discard them"
 
-    def accept(self) -> str:
-        """Write the moved rig, and have the server use it. Raises WebError without a measurement."""
-        if self._change is None:
-            raise WebError("there is no measurement to accept; measure first")
+    def _use(self, change: WorldChange) -> str:
+        """Write the moved rig, and have the server use it; raises as `apply_rig`."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        misses = {name: round(1e3 * distance, 2) for name, distance in self._change.distances.items()}
+        misses = {name: round(1e3 * distance, 2) for name, distance in change.distances.items()}
         world = {"date": now, "command": "the page", "misses_mm": misses}
-        rig = self._change.rig
+        rig = change.rig
         rig = msgspec.structs.replace(rig, calibration={**rig.calibration, "world": world})
-        outcome = apply_rig(self._subscription, self._files, rig)
-        self._forget()
-        return f"the new world is {outcome}"
+        return f"the new world is {apply_rig(self._subscription, self._files, rig)}"
 
-    def discard(self) -> str:
-        """Forget the measurement."""
-        self._forget()
-        return "discarded"
-
-    def _forget(self) -> None:
-        self._change = self._before = None
+    def _forget(self) -> str:
+        self._before = None
         self._preview.draw(None)
+        return ""
 
     def _body_file(self) -> Path:
         if self._by.value == STANDING:
