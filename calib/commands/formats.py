@@ -15,7 +15,7 @@ import tyro
 from calib.commands.output import provenance, write_rig
 from calib.errors import CalibrationError
 from calib.formats import argus, caliscope, colmap, kalibr, multicamselfcal, opencv
-from calib.formats.data import ForeignData, PixelOrigin, PointTable
+from calib.formats.data import OPENCV, ForeignData, PixelOrigin, PointTable
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig, load_rig
 from calib.world.world_frame import scale_rig
@@ -52,18 +52,18 @@ class Format:
 
 
 FORMATS = {
-    "argus": Format(argus.read, argus.write, argus.ARGUS),
-    "easywand": Format(argus.read, argus.write, argus.DLTDV8),
-    "dltdv": Format(argus.read, argus.write, argus.DLTDV8),
-    "multicamselfcal": Format(multicamselfcal.read, multicamselfcal.write, multicamselfcal.FROM_ZERO),
-    "caliscope": Format(caliscope.read, caliscope.write, caliscope.FROM_ZERO),
-    "anipose": Format(caliscope.read, caliscope.write_anipose, caliscope.FROM_ZERO),
-    "pose2sim": Format(caliscope.read, caliscope.write_anipose, caliscope.FROM_ZERO),
-    "ros": Format(opencv.read, opencv.write, opencv.FROM_ZERO),
-    "tagslam": Format(kalibr.read, kalibr.write, kalibr.FROM_ZERO),
-    "opencv": Format(opencv.read, opencv.write, opencv.FROM_ZERO),
-    "kalibr": Format(kalibr.read, kalibr.write, kalibr.FROM_ZERO),
-    "colmap": Format(colmap.read, colmap.write, colmap.FROM_ZERO),
+    "argus": Format(argus.read, argus.write, PixelOrigin(1, y_up=True)),
+    "easywand": Format(argus.read, argus.write, PixelOrigin(1)),
+    "dltdv": Format(argus.read, argus.write, PixelOrigin(1)),
+    "multicamselfcal": Format(multicamselfcal.read, multicamselfcal.write, OPENCV),
+    "caliscope": Format(caliscope.read, caliscope.write, OPENCV),
+    "anipose": Format(caliscope.read, caliscope.write_anipose, OPENCV),
+    "pose2sim": Format(caliscope.read, caliscope.write_anipose, OPENCV),
+    "ros": Format(opencv.read, opencv.write, OPENCV),
+    "tagslam": Format(kalibr.read, kalibr.write, OPENCV),
+    "opencv": Format(opencv.read, opencv.write, OPENCV),
+    "kalibr": Format(kalibr.read, kalibr.write, OPENCV),
+    "colmap": Format(colmap.read, colmap.write, OPENCV),
 }
 
 

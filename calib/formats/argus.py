@@ -42,7 +42,6 @@ from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import invert
 
-DLTDV8, ARGUS = PixelOrigin(1), PixelOrigin(1, y_up=True)
 COLUMN = re.compile(r"\s*pt(\d+)_cam(\d+)_([xy])\s*", re.IGNORECASE)
 COEFFICIENTS = 11
 ASK = (
@@ -112,12 +111,8 @@ def _place(
     found = PixelOrigin(origin.first, y_up=up > 0)
     placed = {}
     for (name, camera), projection in zip(cameras.items(), P, strict=True):
-        back = np.eye(3)
-        corners = found.read(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), camera.height)
-        back[:2, 2], back[:2, :2] = corners[0], (corners[1:] - corners[0]).T
-        placed[name], off = place_by_projection(
-            camera, back @ projection, f"the DLT coefficients of '{name}'"
-        )
+        P_zero = np.linalg.inv(found.matrix(camera.height)) @ projection
+        placed[name], off = place_by_projection(camera, P_zero, f"the DLT coefficients of '{name}'")
         if off > MAX_OFF_PX:
             raise CalibrationError(
                 f"the lens and the DLT coefficients of camera '{name}' differ by up to {off:.0f} px; give the profile "
@@ -154,9 +149,8 @@ def _read_saved(path: Path, origin: PixelOrigin) -> ForeignData:
         raise ConfigError(f"{path}: focalLengths, ppts and nlin are not of the same cameras; save it again")
     cameras = {}
     for k, f in enumerate(focal.tolist(), 1):
-        cx, cy = centres[k - 1].tolist()
-        lens = {"fx": f, "fy": f, "cx": cx, "cy": cy, "distortion": tuple(distortion[k - 1].tolist())}
-        cameras[f"cam{k}"] = make_camera(width[k - 1], height[k - 1], **lens)
+        size = width[k - 1], height[k - 1]
+        cameras[f"cam{k}"] = make_camera(size, (f, f), centres[k - 1], distortion[k - 1])
     remarks: tuple[str, ...] = () if origin.y_up else (ASK,)
     if coefficients.shape == (COEFFICIENTS, len(focal)) and np.isfinite(coefficients).all():
         cameras, origin, remarks = _place(cameras, _projections(coefficients), origin)
@@ -210,8 +204,8 @@ def _read_profile(path: Path) -> dict[str, Camera]:
                 "profiles can't be imported"
             )
         number, focal, width, height, cx, cy, ratio, *distortion = row
-        lens = {"fx": focal, "fy": focal * ratio, "cx": cx, "cy": cy, "distortion": tuple(distortion)}
-        cameras[f"cam{number:g}"] = make_camera(width, height, **lens)
+        lens = (width, height), (focal, focal * ratio), (cx, cy), distortion
+        cameras[f"cam{number:g}"] = make_camera(*lens)
     return cameras
 
 
@@ -299,9 +293,5 @@ def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
 
 def _dlt(camera: Camera, origin: PixelOrigin) -> Array:
     """(11,) coefficients: the projection matrix row by row, divided by its last element, without that."""
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    there = origin.write(corners, camera.height)
-    to_format = np.eye(3)
-    to_format[:2, 2], to_format[:2, :2] = there[0], (there[1:] - there[0]).T
-    P = to_format @ camera.K @ invert(camera.matrix())[:3]
+    P = origin.matrix(camera.height) @ camera.K @ invert(camera.matrix())[:3]
     return (P / P[2, 3]).ravel()[:11]

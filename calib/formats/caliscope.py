@@ -27,11 +27,10 @@ from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.config import is_name, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import Pose, invert, rotation_from_vector, vector_from_rotation
+from camera_node.geometry.pose import invert, rotation_from_vector, vector_from_rotation
 
 POINTS, TIMES = ("sync_index", "img_loc_x", "img_loc_y"), ("sync_index", "cam_id", "frame_time")
 PLACE = ("obj_loc_x", "obj_loc_y", "obj_loc_z")
-FROM_ZERO = PixelOrigin(0)
 MAX_FRAME, MAX_MARKER = 1e12, 1e6
 SAME_M = 1e-6  # of a point of a rigid object
 
@@ -112,25 +111,18 @@ def _name(key: str, entry: Mapping[str, Any]) -> str:
 
 
 def _build(entry: Mapping[str, Any]) -> Camera:
-    K, (width, height) = np.asarray(entry["matrix"], float).reshape(3, 3), entry["size"]
-    fisheye = bool(entry.get("fisheye", False))
-    distortion = np.ravel(np.asarray(entry.get("distortions", ()), float)).tolist()
-    pose = None
+    K, T = np.asarray(entry["matrix"], float).reshape(3, 3), None
     if not any(_is_absent(entry.get(name)) for name in ("rotation", "translation")):
         rotation, T = np.asarray(entry["rotation"], float), np.eye(4)
         T[:3, :3] = rotation if rotation.shape == (3, 3) else rotation_from_vector(rotation.ravel())
         T[:3, 3] = np.ravel(np.asarray(entry["translation"], float))
-        pose = Pose.from_matrix(invert(T))
     return make_camera(
-        width=width,
-        height=height,
-        fx=float(K[0, 0]),
-        fy=float(K[1, 1]),
-        cx=float(K[0, 2]),
-        cy=float(K[1, 2]),
-        distortion=tuple(distortion),
-        model="fisheye" if fisheye else "pinhole",
-        T_world_cam=pose,
+        entry["size"],
+        np.diag(K)[:2],
+        K[:2, 2],
+        np.ravel(np.asarray(entry.get("distortions", ()), float)),
+        bool(entry.get("fisheye", False)),
+        T,
     )
 
 
@@ -247,8 +239,7 @@ def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
     Raises:
         CalibrationError: the pixel origin is another than OpenCV's.
     """
-    if origin != FROM_ZERO:
-        raise CalibrationError("Caliscope counts pixels as OpenCV; leave out --first-pixel and --y-up")
+    origin.require_opencv("Caliscope")
     tables = [_table(k, name, camera) for k, (name, camera) in enumerate(rig.cameras.items())]
     write_atomically(folder / "camera_array.toml", "\n".join(tables))
     return ["camera_array.toml"]
@@ -260,8 +251,7 @@ def write_anipose(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
     Raises:
         CalibrationError: the pixel origin is another than OpenCV's, or a camera has no pose.
     """
-    if origin != FROM_ZERO:
-        raise CalibrationError("Anipose counts pixels as OpenCV; leave out --first-pixel and --y-up")
+    origin.require_opencv("Anipose")
     if bare := [name for name, camera in rig.cameras.items() if camera.T_world_cam is None]:
         raise CalibrationError(f"camera '{bare[0]}' has no pose; run roundel calibrate wand, or leave it out")
     tables = []

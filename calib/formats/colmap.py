@@ -17,22 +17,20 @@ from calib.rig.camera import Camera
 from calib.rig.rig import MAX_CAMERAS, Rig
 from camera_node.foundation.config import is_name, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import Pose, invert, rotation_from_wxyz, wxyz_from_rotation
+from camera_node.geometry.pose import invert, rotation_from_wxyz, wxyz_from_rotation
 
-FROM_ZERO = PixelOrigin(0)
-HALF_PX = 0.5
 SHORT, FULL = 4, 8  # distortion coefficients of OPENCV and of FULL_OPENCV
-# Of each model: whether it has two focal lengths, the number of its coefficients, and OpenCV's model of the lens.
+# Of each model: whether it has two focal lengths, the number of its coefficients, and whether it is a fisheye.
 MODELS = {
-    "SIMPLE_PINHOLE": (False, 0, "pinhole"),
-    "PINHOLE": (True, 0, "pinhole"),
-    "SIMPLE_RADIAL": (False, 1, "pinhole"),
-    "RADIAL": (False, 2, "pinhole"),
-    "OPENCV": (True, 4, "pinhole"),
-    "FULL_OPENCV": (True, 8, "pinhole"),
-    "SIMPLE_RADIAL_FISHEYE": (False, 1, "fisheye"),
-    "RADIAL_FISHEYE": (False, 2, "fisheye"),
-    "OPENCV_FISHEYE": (True, 4, "fisheye"),
+    "SIMPLE_PINHOLE": (False, 0, False),
+    "PINHOLE": (True, 0, False),
+    "SIMPLE_RADIAL": (False, 1, False),
+    "RADIAL": (False, 2, False),
+    "OPENCV": (True, 4, False),
+    "FULL_OPENCV": (True, 8, False),
+    "SIMPLE_RADIAL_FISHEYE": (False, 1, True),
+    "RADIAL_FISHEYE": (False, 2, True),
+    "OPENCV_FISHEYE": (True, 4, True),
 }
 POSE_WORDS = 10  # of a line of images.txt: number, quaternion, translation, camera, name
 UNSCALED = "COLMAP's world has no scale unless it was aligned: calibrate with a wand, or give --unit-m"
@@ -44,8 +42,7 @@ def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
     Raises:
         ConfigError, CalibrationError: a file is neither, or has impossible values.
     """
-    if origin != FROM_ZERO:
-        raise CalibrationError("COLMAP has its own pixel origin; leave out --first-pixel and --y-up")
+    origin.require_opencv("COLMAP")
     folder = paths[0] if paths[0].is_dir() else None
     files = [folder / "cameras.txt", folder / "images.txt"] if folder else list(paths)
     by_name = {path.name: path for path in files if path.exists()}
@@ -56,7 +53,7 @@ def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
     lenses = _read_lenses(by_name["cameras.txt"])
     placed = _read_images(by_name["images.txt"], lenses) if "images.txt" in by_name else {}
     if not placed:
-        return ForeignData({f"cam{number}": make_camera(**lens) for number, lens in lenses.items()})
+        return ForeignData({f"cam{number}": make_camera(*lens) for number, lens in lenses.items()})
     return ForeignData(placed, remarks=(UNSCALED,))
 
 
@@ -64,35 +61,28 @@ def _rows(path: Path) -> list[list[str]]:
     return [line.split() for line in read_text(path).splitlines() if not line.startswith("#")]
 
 
-def _read_lenses(path: Path) -> dict[str, dict[str, Any]]:
-    """The fields of each lens, by its number."""
+def _read_lenses(path: Path) -> dict[str, tuple[Any, Any, Any, Any, Any]]:
+    """Size, focal lengths, centre, coefficients and kind of each lens, by its number."""
     lenses = {}
     for row in filter(None, _rows(path)):
         where = f"{path}: camera {row[0][:20]}"
         if len(row) < 4 or row[1] not in MODELS:
             raise ConfigError(f"{where}: its model can't be imported; {', '.join(MODELS)} can")
-        two, count, model = MODELS[row[1]]
+        two, count, is_fisheye = MODELS[row[1]]
         try:
             width, height, *numbers = (float(word) for word in row[2:])
             focal, rest = (numbers[:2], numbers[2:]) if two else (numbers[:1] * 2, numbers[1:])
-            (fx, fy), (cx, cy), coefficients = focal, rest[:2], rest[2:]
+            (cx, cy), coefficients = rest[:2], rest[2:]
         except ValueError:
             raise ConfigError(f"{where}: its parameters are not numbers, or too few") from None
         if len(coefficients) != count:
             raise ConfigError(f"{where}: {row[1]} has {count} coefficients, not {len(coefficients)}")
         padded = (*coefficients, *[0.0] * (SHORT - count)) if count else ()
-        size = {"width": width, "height": height, "fx": fx, "fy": fy}
-        lenses[row[0]] = {
-            **size,
-            "cx": cx - HALF_PX,
-            "cy": cy - HALF_PX,
-            "distortion": padded,
-            "model": model,
-        }
+        lenses[row[0]] = (width, height), focal, (cx - 0.5, cy - 0.5), padded, is_fisheye
     return lenses
 
 
-def _read_images(path: Path, lenses: dict[str, dict[str, Any]]) -> dict[str, Camera]:
+def _read_images(path: Path, lenses: dict[str, tuple[Any, Any, Any, Any, Any]]) -> dict[str, Camera]:
     """A camera of each image; every second line has the image's points, and may be empty."""
     cameras: dict[str, Camera] = {}
     for row in filter(None, _rows(path)[::2]):
@@ -112,7 +102,7 @@ def _read_images(path: Path, lenses: dict[str, dict[str, Any]]) -> dict[str, Cam
             raise ConfigError(f"{path}: the pose of image '{row[9][:40]}' is not finite")
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = rotation_from_wxyz(numbers[:4] / np.linalg.norm(numbers[:4])), numbers[4:]
-        cameras[name] = make_camera(**lenses[row[8]], T_world_cam=Pose.from_matrix(invert(T)))
+        cameras[name] = make_camera(*lenses[row[8]], T)
     return cameras
 
 
@@ -122,12 +112,11 @@ def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
     Raises:
         CalibrationError: a lens has more coefficients than COLMAP's models, or the pixel origin is not OpenCV's.
     """
-    if origin != FROM_ZERO:
-        raise CalibrationError("COLMAP has its own pixel origin; leave out --first-pixel and --y-up")
+    origin.require_opencv("COLMAP")
     cameras, images = [], []
     for number, (name, camera) in enumerate(rig.cameras.items(), 1):
         model, distortion = _model(name, camera)
-        parameters = [camera.fx, camera.fy, camera.cx + HALF_PX, camera.cy + HALF_PX, *distortion]
+        parameters = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, *distortion]
         cameras.append(f"{number} {model} {camera.width} {camera.height} {_join(parameters)}\n")
         if camera.T_world_cam is not None:
             T = invert(camera.matrix())

@@ -5,6 +5,7 @@ import csv
 import io
 import os
 import stat
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -60,6 +61,23 @@ class PixelOrigin:
             )
         return np.column_stack([uv[:, 0], height - 1 - uv[:, 1]])
 
+    def matrix(self, height: int) -> Array:
+        """(3, 3) the change of homogeneous pixels into this convention."""
+        corners = self.write(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), height)
+        M = np.eye(3)
+        M[:2, 2], M[:2, :2] = corners[0], (corners[1:] - corners[0]).T
+        return M
+
+    def require_opencv(self, program: str) -> None:
+        """Raise CalibrationError if this is not OpenCV's convention, which is also that of a program."""
+        if self != OPENCV:
+            raise CalibrationError(
+                f"{program} counts pixels from the top left, as OpenCV; leave out --first-pixel and --y-up"
+            )
+
+
+OPENCV = PixelOrigin(0)
+
 
 @dataclass(frozen=True, slots=True)
 class PointTable:
@@ -114,14 +132,29 @@ class ForeignData:
     remarks: tuple[str, ...] = ()
 
 
-def make_camera(width: float, height: float, **values) -> Camera:
-    """A camera of the given image size, pixels, and other fields.
+def make_camera(
+    size: Iterable[float],
+    focal: Iterable[float],
+    centre: Iterable[float],
+    distortion: Iterable[float] = (),
+    fisheye: bool = False,
+    T_cam_world: Array | None = None,
+    time_offset_ms: float = 0.0,
+) -> Camera:
+    """A camera, from width and height, fx and fy, and cx and cy, pixels, and a pose (4, 4) if it has one.
 
     Raises:
         CalibrationError: a value is impossible.
     """
     try:
-        camera = Camera(width=int(width), height=int(height), **values)
+        camera = Camera(
+            **dict(zip(("width", "height"), map(int, size), strict=True)),
+            **dict(zip(("fx", "fy", "cx", "cy"), map(float, (*focal, *centre)), strict=True)),
+            distortion=tuple(map(float, distortion)),
+            model="fisheye" if fisheye else "pinhole",
+            T_world_cam=None if T_cam_world is None else Pose.from_matrix(invert(T_cam_world)),
+            time_offset_ms=time_offset_ms,
+        )
         msgspec.convert(msgspec.to_builtins(camera), Camera)  # the types too
     except (ValueError, TypeError, OverflowError) as error:
         raise CalibrationError(str(error)) from None
@@ -181,15 +214,10 @@ def with_coefficients(name: str, lens: Lens, count: int) -> tuple[Lens, float]:
     shorter = lens.with_parameters([*lens.parameters[:4], *coefficients[:count]])
     if not any(coefficients[count:]):
         return shorter, 0.0
-    u, v = np.meshgrid(np.linspace(0, lens.width - 1, GRID), np.linspace(0, lens.height - 1, GRID))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
+    pixels = _grid_pixels(lens)
     rays = lens.rays(pixels)
     known = np.isfinite(rays).all(axis=1)
-    for _ in range(STEPS):
-        uv, _, J = shorter.project_with_jacobians(rays[known])
-        step = np.linalg.lstsq(J.reshape(-1, J.shape[2]), (pixels[known] - uv).ravel())[0]
-        shorter = shorter.with_parameters(shorter.parameters + step)
-    off = _largest(pixels[known] - shorter.project(rays[known]))
+    shorter, _, off = _fit_lens(shorter, rays[known], pixels[known], turned=False)
     if not off <= MAX_OFF_PX:
         raise CalibrationError(
             f"camera '{name}': its lens can't be written with {count} distortion coefficients, as this format has; "
@@ -216,8 +244,7 @@ def place_by_projection(lens: Camera, P: Array, where: str) -> tuple[Camera, flo
         CalibrationError: the matrix is not that of a camera at a finite place.
     """
     K, R, centre = _decompose(P, where)
-    u, v = np.meshgrid(np.linspace(0, lens.width - 1, GRID), np.linspace(0, lens.height - 1, GRID))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
+    pixels = _grid_pixels(lens)
     xy = lens.normalise(pixels)
     known = np.isfinite(xy).all(axis=1)
     undistorted = np.column_stack([xy[known], np.ones(known.sum())]) @ lens.K.T
@@ -225,14 +252,8 @@ def place_by_projection(lens: Camera, P: Array, where: str) -> tuple[Camera, flo
     if not known.any() or not (rays[:, 2] > 0).all():
         raise CalibrationError(f"{where}: the lens has no undistorted image; check its distortion")
     fitted = lens.with_parameters([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.distortion])
-    turn = np.eye(3)
     try:
-        for _ in range(STEPS):
-            uv, J_point, J_lens = fitted.project_with_jacobians(rays @ turn.T)
-            J = np.concatenate([J_lens, -J_point @ skew(rays @ turn.T)], axis=2)
-            step = np.linalg.lstsq(J.reshape(-1, J.shape[2]), (pixels - uv).ravel())[0]
-            fitted = fitted.with_parameters(fitted.parameters + step[:-3])
-            turn = rotation_from_vector(step[-3:]) @ turn
+        fitted, turn, off = _fit_lens(fitted, rays, pixels, turned=True)
     except (ValueError, np.linalg.LinAlgError):
         raise CalibrationError(
             f"{where}: no lens has these viewing rays; check the files of this camera"
@@ -240,11 +261,28 @@ def place_by_projection(lens: Camera, P: Array, where: str) -> tuple[Camera, flo
     T = np.eye(4)
     T[:3, :3] = turn @ R
     T[:3, 3] = -T[:3, :3] @ centre
-    placed = make_camera(
-        **{name: getattr(fitted, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")},
-        T_world_cam=Pose.from_matrix(invert(T)),
-    )
-    return placed, _largest(pixels - fitted.project(rays @ turn.T))
+    f, centre, shape = fitted.parameters[:2], fitted.parameters[2:4], fitted.distortion
+    return make_camera((lens.width, lens.height), f, centre, shape, T_cam_world=T), off
+
+
+def _grid_pixels(lens: Lens) -> Array:
+    """(n, 2) pixels all over an image."""
+    u, v = np.meshgrid(np.linspace(0, lens.width - 1, GRID), np.linspace(0, lens.height - 1, GRID))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def _fit_lens(lens: Lens, rays: Array, pixels: Array, turned: bool) -> tuple[Lens, Array, float]:
+    """A lens, and with `turned` a rotation (3, 3) of viewing rays (n, 3), adjusted to pixels (n, 2) by Gauss-Newton;
+    and the largest distance, pixels."""
+    turn = np.eye(3)
+    for _ in range(STEPS):
+        uv, J_point, J_lens = lens.project_with_jacobians(rays @ turn.T)
+        by_turn = -J_point @ skew(rays @ turn.T) if turned else np.zeros((len(rays), 2, 3))
+        J = np.concatenate([J_lens, by_turn], axis=2).reshape(-1, J_lens.shape[2] + 3)
+        step = np.linalg.lstsq(J, (pixels - uv).ravel())[0]
+        lens = lens.with_parameters(lens.parameters + step[:-3])
+        turn = rotation_from_vector(step[-3:]) @ turn
+    return lens, turn, float(np.linalg.norm(pixels - lens.project(rays @ turn.T), axis=1).max())
 
 
 def _decompose(P: Array, where: str) -> tuple[Array, Array, Array]:
@@ -256,7 +294,3 @@ def _decompose(P: Array, where: str) -> tuple[Array, Array, Array]:
     K, R, centre = cv2.decomposeProjectionMatrix(P * np.sign(np.linalg.det(P[:, :3])))[:3]
     signs = np.diag(np.sign(np.diag(K)))  # RQ decomposition is unique up to the signs of the diagonal
     return K @ signs / abs(K[2, 2]), signs @ R, (centre[:3] / centre[3]).ravel()
-
-
-def _largest(offsets: Array) -> float:
-    return float(np.linalg.norm(offsets, axis=1).max())

@@ -14,17 +14,15 @@ from typing import Any
 import numpy as np
 import yaml
 
-from calib.errors import CalibrationError
 from calib.formats.data import ForeignData, PixelOrigin, make_camera, with_coefficients
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import read_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import Pose, invert
+from camera_node.geometry.pose import invert
 
-FROM_ZERO = PixelOrigin(0)
-MODELS = {"radtan": "pinhole", "plumb_bob": "pinhole", "equidistant": "fisheye", "none": "pinhole"}
+MODELS = ("radtan", "plumb_bob", "equidistant", "none")
 COEFFICIENTS = 4
 ROTATION_TOLERANCE = 1e-3  # of R^T R from I
 
@@ -45,16 +43,15 @@ def read(paths: Sequence[Path], origin: PixelOrigin) -> ForeignData:
     )
     if not entries or not all(isinstance(entry, Mapping) for entry in entries):
         raise ConfigError(f"{paths[0]} has no cameras cam0, cam1, ...; is it a camchain of Kalibr?")
-    T, first_shift, cameras, chained = np.eye(4), None, {}, True
+    T, first_shift, cameras, chained = np.eye(4), None, {}, len(entries) > 1 and "T_cn_cnm1" in entries[1]
     for k, entry in enumerate(entries):
         where = f"{paths[0]}: cam{k}"
         if k and "T_cn_cnm1" in entry:
-            T = T @ invert(_motion(where, entry["T_cn_cnm1"]))
+            T = _motion(where, entry["T_cn_cnm1"]) @ T
         chained &= k == 0 or "T_cn_cnm1" in entry
         shift = _number(where, entry.get("timeshift_cam_imu", 0.0))
         first_shift = shift if first_shift is None else first_shift
-        pose = Pose.from_matrix(T) if chained and len(entries) > 1 and "T_cn_cnm1" in entries[1] else None
-        cameras[f"cam{k}"] = _build(where, entry, origin, pose, 1e3 * (shift - first_shift))
+        cameras[f"cam{k}"] = _build(where, entry, origin, T if chained else None, 1e3 * (shift - first_shift))
     return ForeignData(_rename(cameras, entries))
 
 
@@ -75,7 +72,7 @@ def _motion(where: str, rows: Any) -> Array:
 
 
 def _build(
-    where: str, entry: Mapping[str, Any], origin: PixelOrigin, pose: Pose | None, offset_ms: float
+    where: str, entry: Mapping[str, Any], origin: PixelOrigin, T: Array | None, offset_ms: float
 ) -> Camera:
     distortion_model = str(entry.get("distortion_model", "none"))
     if entry.get("camera_model") != "pinhole" or distortion_model not in MODELS:
@@ -84,25 +81,16 @@ def _build(
             "imported; pinhole with radtan, plumb_bob, equidistant or none can"
         )
     try:
-        fx, fy, cx, cy = (float(x) for x in entry["intrinsics"])
-        width, height = (float(x) for x in entry["resolution"])
-        distortion = tuple(float(x) for x in entry.get("distortion_coeffs") or ())
+        fx, fy, *centre = (float(x) for x in entry["intrinsics"])
+        size = [float(x) for x in entry["resolution"]]
+        distortion = [float(x) for x in entry.get("distortion_coeffs") or ()]
     except (KeyError, TypeError, ValueError):
-        raise ConfigError(
-            f"{where}: intrinsics needs 4 numbers, resolution 2, distortion_coeffs 4 or 5"
-        ) from None
-    (cx, cy), lens = origin.read(np.array([[cx, cy]]))[0], {"fx": fx, "fy": fy}
-    return make_camera(
-        width=width,
-        height=height,
-        **lens,
-        cx=float(cx),
-        cy=float(cy),
-        distortion=distortion if distortion_model != "none" else (),
-        model=MODELS[distortion_model],
-        T_world_cam=pose,
-        time_offset_ms=offset_ms,
-    )
+        raise ConfigError(f"{where}: its numbers can't be read; distortion_coeffs needs 4 or 5") from None
+    if len(size) != 2 or len(centre) != 2:
+        raise ConfigError(f"{where}: intrinsics needs 4 numbers, and resolution 2")
+    shape = distortion if distortion_model != "none" else ()
+    centre, fisheye = origin.read(np.array([centre]))[0], distortion_model == "equidistant"
+    return make_camera(size, (fx, fy), centre, shape, fisheye, T, offset_ms)
 
 
 def _rename(cameras: Mapping[str, Camera], entries: Sequence[Mapping[str, Any]]) -> dict[str, Camera]:
@@ -117,10 +105,7 @@ def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
     Raises:
         CalibrationError: a lens can't be expressed with k1, k2, p1, p2, or the pixel origin is not OpenCV's.
     """
-    if origin != FROM_ZERO:
-        raise CalibrationError(
-            "Kalibr counts pixels from 0 at the top left; leave out --first-pixel and --y-up"
-        )
+    origin.require_opencv("Kalibr")
     chain, before = {}, None
     placed = len(rig.placed()) == len(rig.cameras)
     for k, (name, camera) in enumerate(rig.cameras.items()):

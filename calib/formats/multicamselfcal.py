@@ -38,7 +38,6 @@ from camera_node.foundation.config import require_name, write_atomically
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import invert
 
-FROM_ZERO = PixelOrigin(0)
 ENTRY = re.compile(r"\s*([A-Za-z]+\d+)\s*=\s*([^\s;]+)\s*;?\s*")
 CAL_SHAPE, POINT_COLUMNS, COEFFICIENTS = (3, 4), 7, 4
 METRES = {"millimeters": 1e-3, "mm": 1e-3, "centimeters": 1e-2, "cm": 1e-2, "meters": 1.0, "m": 1.0}
@@ -167,25 +166,15 @@ def _build(
     name: str, rad: Path | None, P: Array | None, size: Array, origin: PixelOrigin
 ) -> tuple[Camera, float]:
     """A camera from its `.rad` and its projection, of which one may be missing, and how far its pixels are off."""
-    to_zero = np.eye(3)
-    to_zero[:2, 2] = origin.read(np.zeros((1, 2)))[0]
-    P = None if P is None else to_zero @ P
-    width, height = size
+    P = None if P is None else np.linalg.inv(origin.matrix(int(size[1]))) @ P
     if rad is None:
         assert P is not None
-        bare = make_camera(width, height, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+        bare = make_camera(size, (1.0, 1.0), (0.0, 0.0))
         return place_by_projection(bare, P, f"the .cal file of '{name}'")
     lens = _read_entries(rad, ["K11", "K13", "K22", "K23"])
-    centre = origin.read(np.array([[lens["K13"], lens["K23"]]]))[0].tolist()
-    camera = make_camera(
-        width,
-        height,
-        fx=lens["K11"],
-        fy=lens["K22"],
-        cx=centre[0],
-        cy=centre[1],
-        distortion=tuple(lens.get(f"kc{k}", 0.0) for k in range(1, 5)),
-    )
+    centre = origin.read(np.array([[lens["K13"], lens["K23"]]]))[0]
+    shape = [lens.get(f"kc{k}", 0.0) for k in range(1, 5)]
+    camera = make_camera(size, (lens["K11"], lens["K22"]), centre, shape)
     return (camera, 0.0) if P is None else place_by_projection(camera, P, f"the .cal file of '{name}'")
 
 

@@ -19,15 +19,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.errors import CalibrationError
 from calib.formats.data import ForeignData, PixelOrigin, make_camera, read_text
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.foundation.config import is_name, parse_yaml, read_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import Pose, invert, rotation_from_vector
+from camera_node.geometry.pose import invert, rotation_from_vector
 
-FROM_ZERO = PixelOrigin(0)
 MULTIVIEW = ("Ks", "distortions", "rvecs", "Ts", "image_sizes", "is_fisheye", "cam_ids")
 BLOCK = re.compile(r"^(\w+):.*\n(?:[ \t].*\n|\n)*", re.MULTILINE)
 MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "M", "M1", "intrinsic_matrix")
@@ -102,36 +100,21 @@ def _read_multiview(path: Path, data: Any) -> dict[str, Camera]:
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = rotation_from_vector(turns[k]), shifts[k]
         of_model = distortions[k][:4] if fisheye[k, 0] else distortions[k]
-        cameras[name] = make_camera(
-            *sizes[k],
-            **dict(zip(("fx", "cx", "fy", "cy"), K[k][[0, 2, 4, 5]].tolist(), strict=True)),
-            distortion=tuple(of_model.tolist()),
-            model="fisheye" if fisheye[k, 0] else "pinhole",
-            T_world_cam=Pose.from_matrix(invert(T)),
-        )
+        lens = sizes[k], K[k][[0, 4]], K[k][[2, 5]], of_model, bool(fisheye[k, 0])
+        cameras[name] = make_camera(*lens, T)
     return cameras
 
 
 def _build(path: Path, data: Mapping[str, Any], origin: PixelOrigin) -> Camera:
-    K, distortion = _matrix(path, data, MATRIX), _matrix(path, data, DISTORTION)
+    K = _matrix(path, data, MATRIX).reshape(3, 3)
     model = str(data.get("distortion_model") or data.get("model") or "")
     if model not in FISHEYE + PINHOLE:
         raise ConfigError(
             f"{path}: can't import the distortion model '{model[:40]}', but plumb_bob and equidistant"
         )
     fisheye = model in FISHEYE or bool(data.get("fisheye_model", 0))
-    width, height = _size(path, data)
-    centre = origin.read(K.reshape(3, 3)[None, :2, 2])[0]
-    return make_camera(
-        width=width,
-        height=height,
-        fx=float(K.reshape(3, 3)[0, 0]),
-        fy=float(K.reshape(3, 3)[1, 1]),
-        cx=float(centre[0]),
-        cy=float(centre[1]),
-        distortion=tuple(distortion.tolist()),
-        model="fisheye" if fisheye else "pinhole",
-    )
+    centre, distortion = origin.read(K[None, :2, 2])[0], _matrix(path, data, DISTORTION)
+    return make_camera(_size(path, data), np.diag(K)[:2], centre, distortion, fisheye)
 
 
 def _matrix(path: Path, data: Mapping[str, Any], names: Sequence[str]) -> np.ndarray:
@@ -158,13 +141,9 @@ def _size(path: Path, data: Mapping[str, Any]) -> tuple[float, float]:
     ]
     pairs += [(data.get("image_Width"), data.get("image_Height")), (data.get("width"), data.get("height"))]
     for pair in pairs:
-        values = pair.get("data") if isinstance(pair, Mapping) else pair
-        if (
-            isinstance(values, list | tuple)
-            and len(values) == 2
-            and all(isinstance(x, int | float) for x in values)
-        ):
-            return values[0], values[1]
+        match pair.get("data") if isinstance(pair, Mapping) else pair:
+            case [int() | float() as width, int() | float() as height]:
+                return width, height
     raise ConfigError(f"{path} has no image size; add the lines image_width and image_height")
 
 
@@ -174,10 +153,7 @@ def write(rig: Rig, folder: Path, origin: PixelOrigin) -> list[str]:
     Raises:
         CalibrationError: the pixel origin is another than OpenCV's.
     """
-    if origin != FROM_ZERO:
-        raise CalibrationError(
-            "OpenCV counts pixels from 0 at the top left; leave out --first-pixel and --y-up"
-        )
+    origin.require_opencv("ROS")
     for name, camera in rig.cameras.items():
         write_atomically(folder / f"{name}.yaml", _dump(name, camera))
     return [f"{name}.yaml" for name in rig.cameras]
