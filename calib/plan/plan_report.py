@@ -4,6 +4,7 @@ and the distribution of errors."""
 
 import base64
 import io
+import textwrap
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.plan.plan_summary import PlanSummary, describe, summarize
+from calib.plan.plan_summary import describe
 from calib.plan.planner import PlanReport
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import write_atomically
@@ -20,17 +21,9 @@ from camera_node.foundation.extras import require
 
 LEVELS = 3  # maps, from the lowest to the highest level
 ARROW_M = 0.6
-BLIND = "#d8d8d8"
 INK = "#28231e"
 AXIS_COLOUR = "#c85a14"
 SUFFIXES = (".html", ".pdf")
-PAGE_INCH = (8.27, 11.69)
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #28231e; max-width: 70rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse; margin: 1rem 0 } td, th { padding: .25rem .8rem; text-align: right }
-th { border-bottom: 1px solid #888 } td:first-child, th:first-child { text-align: left }
-img { max-width: 100%; display: block; margin: 1rem 0 } .met { color: #1a7f37 } .missed { color: #b42318 }
-"""
 
 
 def draw_errors(report: PlanReport) -> Any:
@@ -79,7 +72,7 @@ def _draw_levels(
     mesh = None
     for axes, level in zip(every, levels, strict=True):
         layer = np.ma.masked_invalid(values[level])
-        axes.set_facecolor(BLIND)
+        axes.set_facecolor("#d8d8d8")  # blind places
         mesh = axes.pcolormesh(
             volume.x, volume.y, layer, vmin=limits[0], vmax=limits[1], cmap=colours, shading="nearest"
         )
@@ -131,16 +124,15 @@ def write_report(report: PlanReport, path: Path, title: str) -> None:
 
 
 def _html(report: PlanReport, title: str) -> str:
-    """The page; its pictures are part of it."""
-    summary = summarize(report)
+    """The page: what is printed, and the figures, which are part of it."""
     images = "".join(
-        f"<h2>{heading}</h2><img alt='{heading}' src='data:image/png;base64,{_png(figure)}'>"
+        f"<h2>{heading}</h2><img alt='{heading}' style='max-width: 100%' src='data:image/png;base64,{_png(figure)}'>"
         for heading, figure in _figures(report)
     )
+    text = escape("\n".join(describe(report)))
     return (
-        f"<!doctype html><html lang='en'><meta charset='utf-8'><title>{escape(title)}</title><style>{STYLE}</style>"
-        f"<h1>{escape(title)}</h1>{_verdict(summary)}{_table(_overview(summary))}{images}"
-        f"<h2>Cameras</h2>{_table(_camera_rows(summary))}<h2>Blind spots</h2>{_blind(report)}"
+        f"<!doctype html><html lang='en'><meta charset='utf-8'><title>{escape(title)}</title><h1>{escape(title)}</h1>"
+        f"<pre style='white-space: pre-wrap'>{text}</pre>{images}"
         "<p>Errors are root mean square distances between a robot's position and its estimate from one frame set. "
         "Range: Faigl, Krajnik, Chudoba and Saska, ICRA 2013, Section IV.</p></html>"
     )
@@ -154,65 +146,6 @@ def _figures(report: PlanReport) -> Sequence[tuple[str, Any]]:
     )
 
 
-def _overview(summary: PlanSummary) -> list[tuple[str, ...]]:
-    return [
-        ("", "value"),
-        ("two cameras or more see", f"{summary.covered:.1%} of the volume"),
-        ("one camera sees", f"{summary.single:.1%}"),
-        ("expected error, median", _with_unit(summary.median_error_mm, "mm")),
-        ("expected error, 95 % quantile", _with_unit(summary.p95_error_mm, "mm")),
-        ("orientation, median", _with_unit(summary.median_orientation_deg, "degrees")),
-        ("rate", f"{summary.fastest_hz:g} Hz"),
-        ("detections", f"{summary.detections_s:.0f} a second"),
-        ("network load of the server", f"{summary.network_bit_s / 1e6:.2f} Mbit/s"),
-    ]
-
-
-def _camera_rows(summary: PlanSummary) -> list[tuple[str, ...]]:
-    header = ("camera", "x, m", "y, m", "z, m", "nearest, m", "farthest, m", "sees", "Hz", "kbit/s")
-    rows = [
-        (
-            name,
-            *(f"{x:.2f}" for x in camera.position_m),
-            f"{camera.v_min_m:.2f}",
-            f"{camera.v_max_m:.2f}",
-            f"{camera.share:.0%}",
-            f"{camera.fps:g}",
-            f"{camera.bit_s / 1e3:.0f}",
-        )
-        for name, camera in summary.cameras.items()
-    ]
-    return [header, *rows]
-
-
-def _verdict(summary: PlanSummary) -> str:
-    if summary.is_sufficient is None:
-        return ""
-    kind, word = ("met", "is met") if summary.is_sufficient else ("missed", "is not met")
-    return (
-        f"<p class='{kind}'>The requirement of {summary.required_error_mm:g} mm in {summary.required_share:.0%} of the "
-        f"volume {word}: {summary.share_within_required:.1%}.</p>"
-    )
-
-
-def _blind(report: PlanReport) -> str:
-    if not report.blind:
-        return "<p>None: at least two cameras see every place.</p>"
-    return "<ul>" + "".join(f"<li>{escape(region.describe())}</li>" for region in report.blind) + "</ul>"
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    """A table with a header row, of plain text."""
-    head, *body = rows
-    lines = ["".join(f"<th>{escape(cell)}</th>" for cell in head)]
-    lines += ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in body]
-    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
-
-
-def _with_unit(value: float | None, unit: str) -> str:
-    return "not known" if value is None else f"{value:.2f} {unit}"
-
-
 def _png(figure: Any) -> str:
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=110)
@@ -222,15 +155,11 @@ def _png(figure: Any) -> str:
 def _write_pdf(report: PlanReport, path: Path, title: str) -> None:
     """A page of text, then one page for each figure."""
     backend = require("matplotlib.backends.backend_pdf", "plan", "the report")
-    figure = require("matplotlib.figure", "plan", "the report").Figure(figsize=PAGE_INCH)
-    text = "\n".join([title, "", *(line for full in describe(report) for line in _wrap(full))])
+    figure = require("matplotlib.figure", "plan", "the report").Figure(figsize=(8.27, 11.69))  # A4, inches
+    text = "\n".join([title, "", *(line for full in describe(report) for line in textwrap.wrap(full, 110))])
     figure.text(0.06, 0.96, text, va="top", family="monospace", fontsize=7)
     data = io.BytesIO()
     with backend.PdfPages(data) as pages:
         for page in (figure, *(drawn for _, drawn in _figures(report))):
             pages.savefig(page)
     write_atomically(path, data.getvalue())
-
-
-def _wrap(line: str, columns: int = 110) -> list[str]:
-    return [line[k : k + columns] for k in range(0, len(line), columns)] or [""]

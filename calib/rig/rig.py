@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
@@ -24,17 +25,20 @@ from camera_node.protocol.messages import MAX_READOUT_US
 T = TypeVar("T")
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")  # the fields that every camera needs
 MAX_CAMERAS = 256
-MAX_IMAGE_PX = 64e6  # pixels of one image; the server computes a table of the lens in 3 s and 0.7 GB
-MAX_RIG_PX = 1e9  # pixels of all images together
-FOCAL_PX = (1.0, 1e6)
-MAX_CENTRE = 10.0  # of the principal point, in images' sides: a cropped image may not contain it
-MAX_DISTORTION = 1e6
-MAX_POSITION_M = 1e5
-QUATERNION_NORM = (1e-6, 1e6)
-MAX_TIME_OFFSET_MS = 86_400_000.0  # a day: recordings of one session
-MAX_TIME_DRIFT_PPM = 1e5  # three times the largest drift that a calibration estimates
-MAX_COVARIANCE = 1e12
-MAX_ERROR_COLUMNS = ERRORS * MAX_JOINT
+MAX_IMAGE_PX, MAX_RIG_PX = (
+    64e6,
+    1e9,
+)  # of one image, whose table of the lens takes 3 s and 0.7 GB; of all together
+# The largest plausible numbers of a camera: clocks of one session (a day; three times the largest drift that a
+# calibration estimates).
+MOST = {
+    "time_offset_ms": 86_400_000.0,
+    "time_drift_ppm": 1e5,
+    "readout_us": MAX_READOUT_US,
+    "distortion": 1e6,
+    "covariance": 1e12,
+    "errors": 1e12,
+}
 MAX_FIGURES, MAX_DEPTH, MAX_TEXT = 50_000, 8, 10_000  # of the `calibration` map: values, nesting, characters
 
 
@@ -172,52 +176,34 @@ def check_cameras(cameras: Mapping[str, Camera]) -> None:
 
 def _find_fault(camera: Camera) -> str:
     """The first value that is not plausible; empty if all are."""
-    if camera.width * camera.height > MAX_IMAGE_PX:
-        return f"an image of {camera.width} x {camera.height} px; the limit is {MAX_IMAGE_PX:.0e} px"
-    if not all(FOCAL_PX[0] <= f <= FOCAL_PX[1] for f in (camera.fx, camera.fy)):
-        return f"the focal lengths fx and fy must be within {FOCAL_PX[0]:g} and {FOCAL_PX[1]:g} px"
-    if abs(camera.cx) > MAX_CENTRE * camera.width or abs(camera.cy) > MAX_CENTRE * camera.height:
-        return "the principal point cx, cy is far outside of the image"
-    if any(abs(k) > MAX_DISTORTION for k in camera.distortion):
-        return f"a distortion number is beyond {MAX_DISTORTION:g}"
-    if not abs(camera.time_offset_ms) <= MAX_TIME_OFFSET_MS:  # NaN is not
-        return f"time_offset_ms must be within {MAX_TIME_OFFSET_MS:g} ms"
-    if not (abs(camera.time_drift_ppm) <= MAX_TIME_DRIFT_PPM and 0 <= camera.time_reference_ns < 2**63):
-        return f"time_drift_ppm must be within {MAX_TIME_DRIFT_PPM:g}, and time_reference_ns a stamp"
-    if not abs(camera.readout_us or 0.0) <= MAX_READOUT_US:
-        return f"readout_us must be within {MAX_READOUT_US:g}"
-    return _find_fault_of_pose(camera)
+    return next((fault for is_fault, fault in _possible_faults(camera) if is_fault), "")
 
 
-def _find_fault_of_pose(camera: Camera) -> str:
-    if (pose := camera.T_world_cam) is not None:
-        if max(map(abs, pose.position_m)) > MAX_POSITION_M:
-            return f"position_m must be within {MAX_POSITION_M:g} m"
-        if not QUATERNION_NORM[0] <= math.hypot(*pose.wxyz) <= QUATERNION_NORM[1]:
-            return f"the norm of wxyz must be within {QUATERNION_NORM[0]:g} and {QUATERNION_NORM[1]:g}"
-    if (covariance := camera.covariance) is not None:
-        if len(covariance) != 6 or any(len(row) != 6 for row in covariance):
-            return "covariance must be 6 x 6"
-        if not all(abs(x) <= MAX_COVARIANCE for row in covariance for x in row):
-            return f"the covariance must be finite and within {MAX_COVARIANCE:g}"
-        if min(covariance[k][k] for k in range(6)) < 0:
-            return "a variance is below 0"
-    return _find_fault_of_errors(camera.errors)
-
-
-def _find_fault_of_errors(errors: tuple[tuple[float, ...], ...] | None) -> str:
-    if errors is None:
-        return ""
-    width = len(errors[0]) if errors else 0
-    if (
-        len(errors) != ERRORS
-        or any(len(row) != width for row in errors)
-        or not 0 < width <= MAX_ERROR_COLUMNS
-    ):
-        return f"errors must have {ERRORS} equal rows of at most {MAX_ERROR_COLUMNS} numbers"
-    if not all(abs(x) <= MAX_COVARIANCE for row in errors for x in row):
-        return f"the numbers of errors must be finite and within {MAX_COVARIANCE:g}"
-    return ""
+def _possible_faults(camera: Camera) -> Iterator[tuple[bool, str]]:
+    size, pose = f"an image of {camera.width} x {camera.height} px", camera.T_world_cam
+    yield camera.width * camera.height > MAX_IMAGE_PX, f"{size}; the limit is {MAX_IMAGE_PX:.0e} px"
+    outside = min(camera.fx, camera.fy) < 1.0 or max(camera.fx, camera.fy) > 1e6
+    yield outside, "the focal lengths fx and fy must be within 1 and 1e6 px"
+    outside = abs(camera.cx) > 10 * camera.width or abs(camera.cy) > 10 * camera.height
+    yield (
+        outside,
+        "the principal point cx, cy is far outside of the image",
+    )  # a cropped one may not contain it
+    yield not 0 <= camera.time_reference_ns < 2**63, "time_reference_ns is no stamp"
+    if pose is not None:
+        yield not np.abs(pose.position_m).max() <= 1e5, "position_m must be finite and within 1e5 m"
+        yield not 1e-6 <= math.hypot(*pose.wxyz) <= 1e6, "the norm of wxyz must be within 1e-6 and 1e6"
+    for name, rows, widest in (("covariance", 6, 6), ("errors", ERRORS, ERRORS * MAX_JOINT)):
+        if (matrix := getattr(camera, name)) is not None:
+            widths = {len(row) for row in matrix}
+            fits = len(matrix) == rows and len(widths) == 1 and 0 < max(widths) <= widest
+            yield not fits, f"{name} must have {rows} equal rows of at most {widest} numbers"
+    for name, most in MOST.items():
+        value = getattr(camera, name)
+        within = np.abs(np.asarray(0.0 if value is None else value)).max(initial=0.0) <= most
+        yield not within, f"{name} must be finite and within {most:g}"  # NaN is not
+    if camera.covariance is not None:
+        yield len(camera.covariance[0]) != 6 or np.diag(camera.covariance).min() < 0, "no covariance (6, 6)"
 
 
 def check_figures(figures: Mapping[str, Any]) -> None:
