@@ -13,6 +13,7 @@ from camera_node.geometry.pose import rotation_with_z
 Vector = tuple[float, float, float]
 MAX_EXTENT_M = 10.0  # of a marker's coordinates and of a roundel's diameter
 MAX_THICKNESS_M = 0.1  # of a wand with two printed sides
+LINE_M = 0.02  # markers within this of a line do not show a rotation about it
 UP: Vector = (0.0, 0.0, 1.0)
 UNIT = 1e-9  # a normal whose length differs from 1 by less stays as it is, so that a saved body equals its original
 
@@ -64,6 +65,17 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     def code_axes(self) -> Array:
         """(M, 3) unit vectors to the zeros of the codes, body frame: the x axis where a print faces +z."""
         return rotation_with_z(self.unit_normals)[:, :, 0]
+
+    @property
+    def needs_headings(self) -> bool:
+        """Whether only the zeros of codes show its rotation: its markers are on one line, along all normals.
+
+        Elsewhere positions and normals show it better than a card that a hand has glued on.
+        """
+        return (
+            np.linalg.matrix_rank(np.vstack([self.points - self.points[0], self.unit_normals]), tol=LINE_M)
+            < 2
+        )
 
     @property
     def card_ratio(self) -> float:

@@ -25,7 +25,7 @@ from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
-from fusion.model.likeness import distances
+from fusion.model.likeness import SIDE_COS, distances
 from fusion.model.robots import MotionModel, Robot
 from fusion.protocol.pose_messages import Markers, Robots, RobotsRequest
 from fusion.protocol.robot_requests import change_robots, request_robots
@@ -38,6 +38,8 @@ MAX_SIZE_ERROR = 0.1
 PLANAR_M = 0.005  # markers within this of a plane show the robot's z axis better than their normals
 SIDES_RAD = math.radians(45)  # between normals of different sides; several sigma of a measured one
 OFF_CENTRE_M = 0.02  # the first marker this far from the centre defines the x axis
+# Columns of a marker that is measured.
+PLACE, NORMAL, SIZE, CODE, ZERO, COLUMNS = slice(0, 3), slice(3, 6), 6, 7, slice(8, 11), 11
 Rows = tuple[tuple[float, float, float], ...]
 LONE = (
     "nothing but its size identifies a robot of one roundel: any other roundel of that size, or its image in a mirror, "
@@ -53,15 +55,32 @@ class StationaryMarkers:
     Attributes:
         position, normal: (K, 3) medians, world, metres, and mean unit vectors, NaN where unknown.
         diameter_m: (K,) median of the discs as they appear, NaN where unknown.
+        code: (K,) that was read, 0 for none.
+        zero: (K, 3) mean unit vectors to the zeros of the codes, world, NaN where unknown.
     """
 
     position: Array
     normal: Array
     diameter_m: Array
+    code: Index
+    zero: Array
+
+    @classmethod
+    def of(cls, seen: Array) -> "StationaryMarkers":
+        """The markers of rows (T, K, 11) as `_unlabeled` gives them, NaN in messages without the marker."""
+        directions = [
+            [_mean_direction(seen[:, k, at]) for k in range(seen.shape[1])] for at in (NORMAL, ZERO)
+        ]
+        normal, zero = (np.array(vectors).reshape(-1, 3) for vectors in directions)
+        sizes = np.array([_median_known(seen[:, k, SIZE]) for k in range(seen.shape[1])])
+        codes = np.array([_only_code(seen[:, k, CODE]) for k in range(seen.shape[1])], np.intp)
+        return cls(np.nanmedian(seen[..., PLACE], 0), normal, sizes, codes, zero)
 
     def select(self, rows: Index | Mask) -> "StationaryMarkers":
         """The markers of a mask or an index array."""
-        return StationaryMarkers(self.position[rows], self.normal[rows], self.diameter_m[rows])
+        return StationaryMarkers(
+            self.position[rows], self.normal[rows], self.diameter_m[rows], self.code[rows], self.zero[rows]
+        )
 
     def within(self, centre: ArrayLike, radius_m: float) -> "StationaryMarkers":
         """The markers within `radius_m` of a point (3,)."""
@@ -98,22 +117,16 @@ def collect_markers(session: zenoh.Session, arena: str, seconds: float) -> list[
 def find_stationary_markers(messages: Sequence[Markers]) -> StationaryMarkers:
     """The unlabeled markers that half of the messages or more contain, at one place."""
     unlabeled = [_unlabeled(message) for message in messages]
-    reference = max(unlabeled, key=len, default=np.empty((0, 7)))
-    seen = np.full(
-        (len(unlabeled), len(reference), 7), np.nan
-    )  # messages x markers x (position, normal, size)
+    reference = max(unlabeled, key=len, default=np.empty((0, COLUMNS)))
+    seen = np.full((len(unlabeled), len(reference), COLUMNS), np.nan)
     for row, markers in zip(seen, unlabeled, strict=True):
-        ours, theirs = _mutual_nearest(reference[:, :3], markers[:, :3])
+        ours, theirs = _mutual_nearest(reference[:, PLACE], markers[:, PLACE])
         row[ours] = markers[theirs]
     seen = seen[:, np.isfinite(seen[:, :, 0]).sum(0) >= max(1, MIN_SEEN * len(seen))]
     if not seen.size:
-        return StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    position = np.nanmedian(seen[..., :3], 0)
-    spread = np.nanmedian(np.linalg.norm(seen[..., :3] - position, axis=2), 0)
-    seen, position = seen[:, spread < STATIONARY_M], position[spread < STATIONARY_M]
-    normals = [_mean_direction(seen[:, k, 3:6]) for k in range(len(position))]
-    sizes = [_median_known(seen[:, k, 6]) for k in range(len(position))]
-    return StationaryMarkers(position, np.array(normals).reshape(-1, 3), np.array(sizes))
+        return StationaryMarkers.of(np.empty((1, 0, COLUMNS)))
+    spread = np.nanmedian(np.linalg.norm(seen[..., PLACE] - np.nanmedian(seen[..., PLACE], 0), axis=2), 0)
+    return StationaryMarkers.of(seen[:, spread < STATIONARY_M])
 
 
 def robot_from_markers(
@@ -123,7 +136,8 @@ def robot_from_markers(
 ) -> Robot:
     """A robot with these markers: its origin is their mean, z is out of the prints, x towards the first marker.
 
-    Of a robot with markers on several sides, z is out of the uppermost side.
+    Of a robot with markers on several sides, z is out of the uppermost side. Of one with codes, x is
+    towards the zero of the first one.
 
     Raises:
         FusionError: there are no markers, they have another diameter, no robot can have them, or the normal of one of
@@ -142,16 +156,19 @@ def robot_from_markers(
         )
     try:
         positions, normals = _in_body(markers)
-        return Robot(diameter_m=diameter_m, markers=positions, normals=normals, motion=motion)
+        codes = tuple(markers.code.tolist()) if markers.code.any() else ()
+        code = codes[0] if len(codes) == 1 else codes
+        return Robot(diameter_m=diameter_m, markers=positions, normals=normals, motion=motion, code=code)
     except ValueError as error:
         raise FusionError(f"these markers make no robot: {error}") from None
 
 
 def _unlabeled(message: Markers) -> Array:
-    """(K, 7) positions, normals and diameters of unlabeled markers that more than one camera sees."""
-    columns = message.positions(), message.normals(), message.diameters()[:, None]
+    """(K, 11) positions, normals, diameters, codes and zeros of unlabeled markers that two or more cameras see."""
+    alone = message.diameters()[:, None], message.codes()[:, None]
+    columns = message.positions(), message.normals(), *alone, message.zeros()
     rows = np.hstack(columns).astype(float)[message.unlabeled()]
-    return rows[np.isfinite(rows[:, :3]).all(1)]
+    return rows[np.isfinite(rows[:, PLACE]).all(1)]
 
 
 def _mutual_nearest(a: Array, b: Array) -> tuple[Index, Index]:
@@ -170,6 +187,12 @@ def _median_known(values: Array) -> float:
     return float(np.median(known)) if len(known) else np.nan
 
 
+def _only_code(codes: Array) -> int:
+    """The code among those that were read (T,), 0 or NaN where none was; 0 unless all are the same."""
+    read = np.unique(codes[codes > 0])
+    return int(read[0]) if len(read) == 1 else 0
+
+
 def _mean_direction(normals: Array) -> Array:
     """(3,) mean direction of the normals (T, 3) that are known; NaN where none is."""
     known = normals[np.isfinite(normals).all(1)]
@@ -186,9 +209,18 @@ def _in_body(markers: StationaryMarkers) -> tuple[Rows, Rows]:
     off = np.linalg.norm(flat, axis=1) >= OFF_CENTRE_M
     if not off.any():
         return ((0.0, 0.0, 0.0),) * len(centred), ()  # one marker; `Robot` refuses several in one place
-    x = flat[np.argmax(off)] / np.linalg.norm(flat[np.argmax(off)])
+    x = _x_axis(markers, z, flat[np.argmax(off)])
     R_world_body = np.asarray(np.column_stack([x, np.cross(z, x), z]), float)
     return _rows(centred @ R_world_body), () if normals is None else _rows(normals @ R_world_body)
+
+
+def _x_axis(markers: StationaryMarkers, z: Array, to_marker: Array) -> Array:
+    """(3,) perpendicular to z: to the zero of the first code whose print faces z, else along `to_marker`."""
+    for zero, normal, code in zip(markers.zero, markers.normal, markers.code, strict=True):
+        across = zero - (zero @ z) * z
+        if code and np.isfinite(zero).all() and not normal @ z < SIDE_COS:
+            return across / np.linalg.norm(across)
+    return to_marker / np.linalg.norm(to_marker)
 
 
 def _rows(vectors: Array) -> Rows:
@@ -300,6 +332,6 @@ def describe(name: str, robots: Robots) -> str:
     defined = f"the server now tracks {name}, with {len(D)} marker{'s' * (len(D) > 1)}"
     entry = msgspec.json.encode({name: robot}).decode()[1:-1].replace('":', '": ').replace(",", ", ")
     notes = (f"; {LOST_AT_RESTART}" if name in robots.unsaved else "") + (
-        f"; {LONE}" if robot.is_single else ""
+        f"; {LONE}" if robot.is_single and not robot.is_coded else ""
     )
     return f"{defined}{f' (distances in mm: {pairs})' if pairs else ''}{notes}; for robots.yaml:\n  {entry}"

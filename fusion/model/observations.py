@@ -274,6 +274,11 @@ class DetectionTable(Columns):
         )
 
 
+def _zeros(robot: Robot) -> Array:
+    """(3, M) see `MarkerTable`."""
+    return robot.code_axes.T if robot.needs_headings else np.full((3, len(robot.markers)), np.nan)
+
+
 def _codes(roundels: Roundels) -> NDArray[np.int32]:
     """(N,) codes that were read, -1 without; numbers that files give are none."""
     return np.where(np.isfinite(roundels.id_probability), roundels.id, -1).astype(np.int32)
@@ -292,7 +297,8 @@ class MarkerTable(Columns):
         number: (K,) index in the robot.
         position, normal: (3, K) centre, and unit normal out of the print; body frame.
         radius: (K,) of the black disc, metres.
-        code: (K,) of the marker, 0 for none; `zero` (3, K) its direction, body frame.
+        code: (K,) of the marker, 0 for none.
+        zero: (3, K) direction of its zero, body frame; NaN for robots that need no headings (`Body.needs_headings`).
         first: (R + 1,): robot r has the rows first[r] to first[r + 1].
     """
 
@@ -319,7 +325,7 @@ class MarkerTable(Columns):
             np.concatenate([np.empty((3, 0)), *(robot.unit_normals.T for robot in robots)], axis=1),
             np.repeat([robot.diameter_m / 2 for robot in robots], counts),
             np.concatenate([np.empty(0, np.intp), *(robot.codes for robot in robots)]).astype(np.intp),
-            np.concatenate([np.empty((3, 0)), *(robot.code_axes.T for robot in robots)], axis=1),
+            np.concatenate([np.empty((3, 0)), *(_zeros(robot) for robot in robots)], axis=1),
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
 

@@ -25,7 +25,7 @@ from camera_node.foundation.config import (
     write_atomically,
 )
 from camera_node.foundation.errors import ConfigError, printable
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import LINE_M, Body
 from fusion.errors import FusionError
 from fusion.model.likeness import DISTINCT_M, likeness, sides, symmetry
 
@@ -84,7 +84,7 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
         if (
             len(self.markers) > 1
             and not self.is_coded
-            and np.linalg.matrix_rank(self.points - self.points[0], tol=0.02) < 2
+            and np.linalg.matrix_rank(self.points - self.points[0], tol=LINE_M) < 2
         ):
             raise ValueError(
                 "two markers, or markers on one line, leave the rotation about the line unknown; "

@@ -155,15 +155,29 @@ class RobotPoses(msgspec.Struct, frozen=True, kw_only=True):
             pose.check()
 
 
+# Bytes of a marker in each column of `Markers`, and the columns that older servers do not publish.
+MARKER_COLUMNS = {
+    "position": 24,
+    "covariance": 36,
+    "normal": 12,
+    "velocity": 12,
+    "candidates": 24,
+    "diameter": 4,
+}
+MARKER_COLUMNS |= {"code": 4, "zero": 12, "robot": 4, "marker": 4, "cameras": 8}
+OPTIONAL_COLUMNS = frozenset({"velocity", "candidates", "diameter", "code", "zero"})
+
+
 class Markers(msgspec.Struct, frozen=True, kw_only=True):
     """All markers of a frame set, labeled and unlabeled.
 
     Columns, one row a marker: `position` (M, 3) <f8 m, world; `covariance` (M, 9) <f4 m^2, row by row; `normal`
     (M, 3) <f4 unit vector out of the printed side and `velocity` (M, 3) <f4 m/s, NaN where unknown; `candidates` (M, 6)
     <f4 the two equally probable normals of a marker that one camera sees, NaN for other markers; `diameter` (M,) <f4 m
-    of the disc of an unlabeled marker as two or more cameras see it, NaN for other markers; `robot` (M,) <i4
-    index into `robots`, -1 for an unlabeled marker; `marker` (M,) <i4 index in that robot, or -1; `cameras` (M,) <u8
-    bit k set if `camera_names[k]` saw it.
+    of the disc of an unlabeled marker as two or more cameras see it, NaN for other markers; `code` (M,) <i4 of an
+    unlabeled marker, 0 for none, and `zero` (M, 3) <f4 unit vector to the zero of that code, world, NaN where unknown;
+    `robot` (M,) <i4 index into `robots`, -1 for an unlabeled marker; `marker` (M,) <i4 index in that robot, or -1;
+    `cameras` (M,) <u8 bit k set if `camera_names[k]` saw it.
     """
 
     version: int = VERSION
@@ -176,6 +190,8 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
     velocity: bytes = b""  # empty if the server does not publish it
     candidates: bytes = b""  # empty if the server does not publish it
     diameter: bytes = b""  # empty if the server does not publish it
+    code: bytes = b""  # empty if the server does not publish it
+    zero: bytes = b""  # empty if the server does not publish it
     robot: bytes
     marker: bytes
     cameras: bytes
@@ -186,13 +202,10 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
     def check(self) -> None:
         """Raise MessageError unless the columns' sizes agree, and positions and robots are in range."""
         n = len(self)
-        sizes = {"position": 24, "covariance": 36, "normal": 12, "robot": 4, "marker": 4, "cameras": 8}
-        for name, size in sizes.items():
-            if len(getattr(self, name)) != n * size:
-                raise MessageError(f"column {name} has {len(getattr(self, name))} bytes for {n} markers")
-        for name, size in {"velocity": 12, "candidates": 24, "diameter": 4}.items():
-            if len(getattr(self, name)) not in (0, size * n):
-                raise MessageError(f"column {name} has {len(getattr(self, name))} bytes for {n} markers")
+        for name, size in MARKER_COLUMNS.items():
+            length = len(getattr(self, name))
+            if length != size * n and (length or name not in OPTIONAL_COLUMNS):
+                raise MessageError(f"column {name} has {length} bytes for {n} markers")
         if not (np.abs(self.positions()) <= MAX_NUMBER).all():  # False for NaN
             raise MessageError("a position is out of range")
         if not (self.robot_index() < len(self.robots)).all():
@@ -220,6 +233,15 @@ class Markers(msgspec.Struct, frozen=True, kw_only=True):
         """(M,) diameters of the discs of unlabeled markers as they appear, metres; NaN where unknown."""
         diameters = np.frombuffer(self.diameter, "<f4")
         return diameters if self.diameter else np.full(len(self), np.nan, np.float32)
+
+    def codes(self) -> NDArray[np.int32]:
+        """(M,) codes of unlabeled markers; 0 for none."""
+        return np.frombuffer(self.code, "<i4") if self.code else np.zeros(len(self), np.int32)
+
+    def zeros(self) -> NDArray[np.float32]:
+        """(M, 3) unit vectors to the zeros of the codes, world; NaN where unknown."""
+        zeros = np.frombuffer(self.zero, "<f4").reshape(-1, 3)
+        return zeros if self.zero else np.full((len(self), 3), np.nan, np.float32)
 
     def robot_index(self) -> NDArray[np.int32]:
         """(M,) index into `robots`, -1 for unlabeled markers."""

@@ -19,9 +19,11 @@ WIDENED = 2.0
 
 
 def read_headings(observations: MatchedObservations) -> Index:
-    """The rows with a rotation."""
-    known = np.isfinite(observations.detections.rotation) & (observations.detections.code >= 0)
-    return np.flatnonzero(known) if observations.discs.zero is not None else np.empty(0, np.intp)
+    """The rows with a rotation that its robot needs."""
+    if observations.discs.zero is None:
+        return np.empty(0, np.intp)
+    known = np.isfinite(observations.detections.rotation) & np.isfinite(observations.discs.zero[0])
+    return np.flatnonzero(known & (observations.detections.code >= 0))
 
 
 def linearize_headings(cameras: CameraArray, states: States, observations: MatchedObservations) -> Array:

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Finds missing robots by the codes of their markers: without comparing distances.
 
-A marker that two cameras name is triangulated, and its outlines and the turn of its code give its whole pose. Three of
-a robot give a more accurate rotation by their positions.
+A marker that two cameras name is triangulated, and its outlines and the turn of its code give its whole pose. Several
+of a robot give its rotation by their positions, so that it does not matter how their cards are turned.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
-from fusion.model.likeness import align
+from camera_node.geometry.body import LINE_M
+from fusion.model.likeness import align, distances
 from fusion.model.observations import CameraArray, DetectionTable
-from fusion.tracking.constellation_search import MIN_MARKERS
+from fusion.model.robots import Robot
 from fusion.tracking.headings import zeros_of
 from fusion.tracking.normals import start_rotation
 from fusion.tracking.rays import Marker, diameters_of, rays_of, triangulate
@@ -57,12 +59,14 @@ def find_named(
     for k in missing.tolist():
         own = np.flatnonzero((table.markers.robot == k) & (table.markers.code > 0))
         views = {row: named[detections.code[named] == table.markers.code[row]] for row in own.tolist()}
+        robot, first = table.robots[k], int(table.markers.first[k])
         seen = {
-            row: _triangulate(cameras, detections, of, table.robots[k].diameter_m)
+            row: _triangulate(cameras, detections, of, robot.diameter_m)
             for row, of in views.items()
             if len(set(detections.camera[of].tolist())) == len(of) >= MIN_VIEWS
         }
-        pose = _pose(cameras, table, detections, seen) if seen else None
+        by_number = {row - first: marker for row, marker in seen.items()}
+        pose = _pose(cameras, robot, detections, by_number) if seen else None
         if pose is None:
             reasons[k] = _reason(views, seen)
             continue
@@ -82,30 +86,71 @@ def _triangulate(cameras: CameraArray, detections: DetectionTable, rows: Index, 
 
 
 def _pose(
-    cameras: CameraArray, table: TrackTable, detections: DetectionTable, seen: dict[int, Marker]
+    cameras: CameraArray, robot: Robot, detections: DetectionTable, seen: dict[int, Marker]
 ) -> tuple[Array, Array] | None:
-    """R (3, 3) and p (3,) of a robot by its named markers (rows of the marker table); None if these contradict."""
-    rows = np.array(list(seen), np.intp)
-    body = table.markers.position[:, rows].T
-    places = np.array([marker.position for marker in seen.values()])
-    if len(rows) >= MIN_MARKERS and np.linalg.matrix_rank(body - body[0], tol=0.02) == 2:
+    """R (3, 3) and p (3,) of a robot by its named markers (by number); None if these contradict.
+
+    Positions show the rotation where they are not on a line; else positions and normals do; else, as of one marker,
+    the zero of the code that most cameras read.
+    """
+    numbers, markers = np.array(list(seen), np.intp), list(seen.values())
+    body, places = robot.points[numbers], np.array([marker.position for marker in markers])
+    if _are_off_line(body):
         return align(body, places)
-    row, marker = max(seen.items(), key=lambda item: len(item[1].detections))
-    radius = float(table.markers.radius[row])
-    normal = start_rotation(cameras, detections, marker, radius)[0][:, 2]
+    radius, reach_m = robot.diameter_m / 2, float(max(distances(body).max(), LINE_M))
+    normals = np.array([start_rotation(cameras, detections, marker, radius)[0][:, 2] for marker in markers])
+    body = np.concatenate([body, body + reach_m * robot.unit_normals[numbers]])
+    places = np.concatenate([places, places + reach_m * normals])
+    if not _are_off_line(body):
+        k = max(range(len(markers)), key=lambda k: len(markers[k].detections))
+        zero = zero_of(cameras, detections, markers[k], normals[k], radius)
+        if not np.isfinite(zero).all():
+            return None
+        body = np.concatenate([body, [body[k] + reach_m * robot.code_axes[numbers[k]]]])
+        places = np.concatenate([places, [markers[k].position + reach_m * zero]])
+    return align(body, places)
+
+
+def _are_off_line(points: Array) -> bool:
+    """Whether points (N, 3) are not all on one line."""
+    return bool(np.linalg.matrix_rank(points - points[0], tol=LINE_M) > 1)
+
+
+def read_codes(
+    cameras: CameraArray, detections: DetectionTable, markers: Sequence[Marker], normals: Array
+) -> tuple[Index, Array]:
+    """Codes (K,) of triangulated markers, 0 without one or where cameras read several; and unit vectors (K, 3), world
+    frame, to their zeros, NaN where unknown.
+
+    Args:
+        cameras: cameras of the rig.
+        detections: of the frame set.
+        markers: K of them.
+        normals: (K, 3) of the markers, world frame, NaN where unknown.
+    """
+    codes, zeros = np.zeros(len(markers), np.intp), np.full((len(markers), 3), np.nan)
+    for k, marker in enumerate(markers):
+        read = detections.code[marker.detections]
+        names = np.unique(read[read >= 0])
+        if len(names) != 1:
+            continue
+        codes[k], radius = names[0], marker.diameter_m / 2
+        normal = normals[k]
+        if not np.isfinite(normal).all():
+            normal = start_rotation(cameras, detections, marker, radius)[0][:, 2]
+        zeros[k] = zero_of(cameras, detections, marker, normal, radius)
+    return codes, zeros
+
+
+def zero_of(
+    cameras: CameraArray, detections: DetectionTable, marker: Marker, normal: Array, radius: float
+) -> Array:
+    """(3,) unit vector, world frame, to the zero of a marker's code; NaN unless the cameras that read it agree."""
     read = marker.detections[np.isfinite(detections.rotation[marker.detections])]
     zeros = zeros_of(cameras, detections.select(read), marker.position, normal, radius)
     mean = zeros.mean(0) if len(zeros) else np.zeros(3)
-    if not np.linalg.norm(mean) > AGREE:
-        return None
-    seen_axes = _axes(mean / np.linalg.norm(mean), normal)
-    R = seen_axes @ _axes(table.markers.zero[:, row], table.markers.normal[:, row]).T
-    return R, marker.position - R @ table.markers.position[:, row]
-
-
-def _axes(zero: Array, normal: Array) -> Array:
-    """(3, 3) columns: the zero of a code, a quarter turn from it, and the normal."""
-    return np.column_stack([zero, np.cross(normal, zero), normal])
+    length = np.linalg.norm(mean)
+    return mean / length if length > AGREE else np.full(3, np.nan)
 
 
 def _reason(views: dict[int, Index], seen: dict[int, Marker]) -> str:

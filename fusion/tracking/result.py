@@ -16,6 +16,7 @@ from fusion.model.observations import Assignments, CameraArray, DetectionTable, 
 from fusion.model.states import States
 from fusion.protocol.pose_messages import Latency, Markers, RobotPose
 from fusion.tracking.estimator import Prediction
+from fusion.tracking.named_markers import read_codes
 from fusion.tracking.rays import Marker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers
@@ -180,7 +181,12 @@ def _tuples(rows: Array) -> list[tuple[Any, ...]]:
 
 
 def markers_message(
-    table: TrackTable, cameras: CameraArray, t_ns: int, marker_cameras: Mask, unlabeled: UnlabeledMarkers
+    table: TrackTable,
+    cameras: CameraArray,
+    t_ns: int,
+    marker_cameras: Mask,
+    unlabeled: UnlabeledMarkers,
+    detections: DetectionTable,
 ) -> Markers:
     """The labeled markers at the poses of their robots, then the unlabeled ones.
 
@@ -190,6 +196,7 @@ def markers_message(
         t_ns: time of the frame set.
         marker_cameras: (K, C) which camera observed which marker; rows without any are left out.
         unlabeled: the others.
+        detections: of the frame set.
     """
     rows = np.flatnonzero(marker_cameras.any(1))
     states, none = table.states, np.full(len(unlabeled.markers), -1)
@@ -197,6 +204,7 @@ def markers_message(
     omega, (arm, covariance) = states.omega[owner], table.marker_positions(rows)
     by_rotation = omega[:, [1, 2, 0]] * arm[:, [2, 0, 1]] - omega[:, [2, 0, 1]] * arm[:, [1, 2, 0]]
     no_candidates = np.full((len(rows), 2, 3), np.nan)
+    codes, zeros = read_codes(cameras, detections, unlabeled.markers, unlabeled.normal)
     bits = np.array([_bits(marker.cameras) for marker in unlabeled.markers], np.uint64)
     return Markers(
         t_ns=t_ns,
@@ -209,6 +217,8 @@ def markers_message(
         diameter=_column(
             "<f4", np.full(len(rows), np.nan), np.array([m.diameter_m for m in unlabeled.markers])
         ),
+        code=_column("<i4", np.zeros(len(rows)), codes),
+        zero=_column("<f4", np.full((len(rows), 3), np.nan), zeros),
         robot=_column("<i4", owner, none),
         marker=_column("<i4", table.markers.number[rows], none),
         candidates=_column("<f4", no_candidates, unlabeled.candidates),

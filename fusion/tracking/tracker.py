@@ -314,7 +314,7 @@ class Tracker:
         return TrackingResult(
             t_ns,
             tuple(poses[k] for k in sorted(poses)),
-            markers_message(table, self.cameras, t_ns, marker_cameras, unlabeled),
+            markers_message(table, self.cameras, t_ns, marker_cameras, unlabeled, update.detections),
             camera_use(self.cameras, update.detections, update.assignments, unlabeled.markers),
             update.assignments,
             summary,

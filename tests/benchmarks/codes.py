@@ -1,24 +1,44 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Measures codes: shares of certain names, wrong names, headings, false names: `python -m tests.benchmarks.codes`."""
+"""Measures codes: `python -m tests.benchmarks.codes`.
 
-from dataclasses import dataclass, field
+Of cards in pictures: shares of certain names, wrong names, headings, false names. Of 60 identical robots that cross,
+are covered and exchanged (`--part robots`): poses of another robot, and those that are missing.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 import tyro
 from rich.console import Console
 
 from camera_node.detection.detector import Detector
+from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array
 from camera_node.geometry import codes
+from camera_node.geometry.pose import rotation_from_vector
 from camera_node.simulation.sensor import SENSORS, SensorName
+from fusion.model.robots import Robot
+from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.tracking.named_markers import MIN_VIEWS
+from fusion.tracking.tracker import Tracker
 from tests.benchmarks.detector.negatives import clutter, letters, text_pages
 from tests.benchmarks.detector.photographs import photographs
 from tests.benchmarks.detector.pictures import Card, grid, missed, paste, rotation_of
 from tests.benchmarks.detector.recall import SIZE, ground
 from tests.benchmarks.detector.table import table
+from tests.fusion.synthetic import PERIOD_NS, Arena, ring
 
 CELLS = {0: (11, 12, 14, 16, 20), 45: (12, 14, 16, 20), 60: (14, 16, 20, 24)}  # diameters by tilt, degrees
 FRAMES = (1, 10)
+ROBOTS, CAMERAS = 60, 8
+DIAMETER_M = 0.08
+UNSEEN, UNREAD = 0.1, 0.2  # shares of the views that are not detected, and of the detections without a name
+HIDDEN_S, PERIOD_S = 0.5, 2.0  # how long a robot is covered, and how often
+WRONG_M = 0.05  # of a pose of another robot
+WITHIN_S = 0.2  # goal of the acquisition after two cameras see a robot
 NEAR = 0.2  # distance from the true centre at which a card counts as found, diameters
 
 
@@ -84,6 +104,85 @@ def compare(
 
 
 @dataclass(frozen=True)
+class Crossing:
+    """The places of identical robots on Lissajous figures through the arena.
+
+    Each is covered in a part of each period; a neighbour whose cover ends at the same time takes its place meanwhile.
+    """
+
+    rate: Array
+    phase: Array
+    begin_s: Array
+
+    @classmethod
+    def of(cls, rng: np.random.Generator) -> "Crossing":
+        """Random ones; two robots at a time are covered together, and exchanged in every other period."""
+        pairs = np.repeat(rng.uniform(0.3, PERIOD_S - HIDDEN_S, ROBOTS // 2), 2)
+        return cls(rng.uniform(0.3, 0.7, (ROBOTS, 2)), rng.uniform(0, 2 * np.pi, (ROBOTS, 2)), pairs)
+
+    def is_covered(self, k: int, t: float) -> bool:
+        """Whether no camera sees robot k."""
+        return 0 <= t % PERIOD_S - self.begin_s[k] < HIDDEN_S
+
+    def place(self, k: int, t: float) -> tuple[Array, Array]:
+        """R (3, 3) and p (3,) of robot k, which drives along its figure, or along that of the other one of its pair."""
+        ended = (
+            int((t - self.begin_s[k] - HIDDEN_S / 2) // PERIOD_S) + 1
+        )  # covers that have passed their middle
+        k = k ^ 1 if ended % 2 else k
+        at = self.rate[k] * t + self.phase[k]
+        x, y = 1.3 * np.sin(at)
+        heading = np.arctan2(*(self.rate[k] * np.cos(at))[::-1])
+        return rotation_from_vector([0.0, 0.0, heading]), np.array([x, y, 0.1 + 0.01 * (k % 10)])
+
+
+def crossing_robots(seconds: float, seed: int = 1) -> tuple[str, ...]:
+    """Track the robots; a row of the table."""
+    rng = np.random.default_rng(seed)
+    crossing = Crossing.of(rng)
+    names = [f"r{k}" for k in range(ROBOTS)]
+    robots = {name: Robot(diameter_m=DIAMETER_M, code=k + 1) for k, name in enumerate(names)}
+    motions = {name: partial(crossing.place, k) for k, name in enumerate(names)}
+    arena = Arena(
+        robots,
+        motions,
+        ring(CAMERAS),
+        tuple(rng.uniform(-0.45, 0.45, CAMERAS)),
+        sigma_px=0.1,
+        hidden=lambda name, _, t: crossing.is_covered(int(name[1:]), t) or rng.uniform() < UNSEEN,
+    )
+    tracker, synchronizer = Tracker(arena.cameras, robots), FrameSynchronizer(PERIOD_NS)
+    for frame in arena.frames(round(seconds * 1e9 / PERIOD_NS)):
+        synchronizer.add(replace(frame, roundels=_partly_read(frame.roundels, rng)))
+    shown = tracked = wrong = late = 0
+    since = np.full(ROBOTS, np.inf)
+    for frame_set in synchronizer.finish():
+        t = arena.seconds(frame_set.t_ns)
+        result = tracker.track(frame_set)
+        poses = {pose.robot: pose for pose in result.poses if pose.state == "tracked"}
+        views = Counter(code for frame in frame_set.frames for code in set(frame.roundels.id.tolist()))
+        for k, name in enumerate(names):
+            since[k] = min(since[k], t) if views[k + 1] >= MIN_VIEWS else np.inf
+            if name in poses:
+                off = np.linalg.norm(np.array(poses[name].position) - crossing.place(k, t)[1])
+                wrong += bool(off > WRONG_M and not crossing.is_covered(k, t))
+            if t - since[k] > WITHIN_S:
+                shown, tracked = shown + 1, tracked + (name in poses)
+                late += name not in poses
+    return str(shown), f"{100 * tracked / shown:.2f}", str(wrong), str(late)
+
+
+def _partly_read(roundels: Roundels, rng: np.random.Generator) -> Roundels:
+    """The roundels, some without a name."""
+    unread = rng.uniform(size=len(roundels)) < UNREAD
+    unknown = {
+        name: np.where(unread, np.nan, getattr(roundels, name))
+        for name in ("id_probability", "rotation_rad", "rotation_sigma")
+    }
+    return replace(roundels, id=np.where(unread, -1, roundels.id).astype(np.int32), **unknown)
+
+
+@dataclass(frozen=True)
 class Benchmark:
     """Measure codes on clutter, by tilt, diameter and number of frames, and false names without codes."""
 
@@ -93,10 +192,22 @@ class Benchmark:
     """Cards of a cell, 48 in a picture."""
     pictures: int = 200
     """Pictures without codes of each kind."""
+    part: Literal["pictures", "robots"] | None = None
+    """Of the benchmark; all without it."""
+    seconds: float = 8.0
+    """Of the robots that cross."""
 
     def run(self) -> None:
-        """Print both tables."""
-        console, rows = Console(width=120), []
+        """Print the tables."""
+        console = Console(width=120)
+        if self.part != "robots":
+            self._read_pictures(console)
+        if self.part != "pictures":
+            headings = ("robots seen for 0.2 s", "% tracked", "poses of another", "missing")
+            console.print(table("60 identical robots", headings, [crossing_robots(self.seconds)]))
+
+    def _read_pictures(self, console: Console) -> None:
+        rows = []
         for tilt, diameters in CELLS.items():
             for diameter in diameters:
                 for frames in FRAMES:

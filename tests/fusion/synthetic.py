@@ -97,7 +97,7 @@ class Arena:
 
     `phases` are the time offsets of the cameras in periods; `hidden(robot, marker, t)` hides markers. A print is
     detected if the cosine of its slant is above `min_facing`. Cameras read all rows in `readout_s`; each marker is seen
-    when its row is read.
+    when its row is read. The card of marker k is turned by k times `card_turn_rad`.
     """
 
     robots: dict[str, Robot]
@@ -110,6 +110,7 @@ class Arena:
     seed: int = 1
     hidden: Callable[[str, int, float], bool] = lambda robot, marker, t: False
     min_facing: float = 0.0
+    card_turn_rad: float = 0.0
 
     def frames(self, n: int) -> list[CalibratedFrame]:
         """`n` frames of every camera, in order of time."""
@@ -185,7 +186,11 @@ class Arena:
         R = np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)
         p = np.array([pose[1] for pose in poses]).reshape(-1, 3)
         centre = p + np.einsum("nij,jn->ni", R, markers.position[:, rows])
-        normal, zero = (np.einsum("nij,jn->ni", R, v[:, rows]) for v in (markers.normal, markers.zero))
+        axes = np.concatenate([robot.code_axes for robot in self.robots.values()])[rows]
+        turn = self.card_turn_rad * markers.number[rows][:, None]
+        normals = markers.normal.T[rows]
+        axes = np.cos(turn) * axes + np.sin(turn) * np.cross(normals, axes)
+        normal, zero = (np.einsum("nij,nj->ni", R, v) for v in (normals, axes))
         return centre, normal, zero
 
     def _roundels(self, camera: Camera, discs: tuple[np.ndarray, ...], rng: np.random.Generator) -> Roundels:

@@ -8,19 +8,7 @@ import msgspec
 import numpy as np
 
 from camera_node.foundation.arrays import Index
-from fusion.protocol.pose_messages import FusionStatus, Markers
-
-COLUMNS = (
-    "position",
-    "covariance",
-    "normal",
-    "velocity",
-    "candidates",
-    "diameter",
-    "robot",
-    "marker",
-    "cameras",
-)
+from fusion.protocol.pose_messages import MARKER_COLUMNS, FusionStatus, Markers
 
 
 def markers_of_zone(markers: Markers, own_cameras: Collection[str]) -> Markers:
@@ -35,13 +23,13 @@ def markers_of_zone(markers: Markers, own_cameras: Collection[str]) -> Markers:
 def join_markers(own: Markers, others: Iterable[Markers]) -> Markers:
     """The markers of all zones with the same robots and cameras as this one; the others follow a change, and join."""
     same = [m for m in others if (m.robots, m.camera_names) == (own.robots, own.camera_names)]
-    columns = {name: b"".join(getattr(m, name) for m in (own, *same)) for name in COLUMNS}
+    columns = {name: b"".join(getattr(m, name) for m in (own, *same)) for name in MARKER_COLUMNS}
     return msgspec.structs.replace(own, **columns)
 
 
 def _select(markers: Markers, rows: Index) -> Markers:
     columns = {}
-    for name in COLUMNS:
+    for name in MARKER_COLUMNS:
         table = np.frombuffer(getattr(markers, name), np.uint8).reshape(len(markers), -1)
         columns[name] = table[rows].tobytes()
     return msgspec.structs.replace(markers, **columns)

@@ -21,7 +21,18 @@ CUBE = load_robots(ROOT / "configs" / "robots_cube.yaml")["cube"]
 SIMILAR = Robot(diameter_m=CUBE.diameter_m, markers=TRIANGLE.markers)
 LARGE = Robot(diameter_m=CUBE.diameter_m, markers=((0.3, 0.0, 0.0), (-0.3, 0.1, 0.0), (0.0, -0.4, 0.0)))
 UNKNOWN = np.full((3, 3), np.nan)
-NO_SIZE = np.full(3, np.nan)
+EQUILATERAL = tuple((0.15 * np.cos(a), 0.15 * np.sin(a), 0.0) for a in np.radians([0.0, 120.0, 240.0]))
+
+
+def plain(points: np.ndarray, normals: np.ndarray) -> StationaryMarkers:
+    """Markers without codes and sizes."""
+    return StationaryMarkers(
+        points,
+        normals,
+        np.full(len(points), np.nan),
+        np.zeros(len(points), int),
+        np.full_like(points, np.nan),
+    )
 
 
 def markers_of(arena: Arena, n: int = 30, declared: Robot = TRIANGLE) -> list[Markers]:
@@ -102,18 +113,42 @@ def test_a_measured_cube_has_the_normals_of_its_sides_and_is_tracked(
     assert [pose.state for pose in tracked] == ["tracked"]
 
 
+@pytest.mark.parametrize(
+    ("markers", "code"), [(SINGLE.markers, 7), (EQUILATERAL, (4, 0, 6))], ids=["one marker", "symmetric"]
+)
+def test_codes_are_measured_and_x_points_to_the_zero_of_the_first(markers: tuple, code: int | tuple):
+    """The cards of a symmetric robot are turned against each other. Tracked with what was measured, its heading is that
+    of the true robot, whose x axis is the zero of its first code, within 1.5 degrees for 0.3 of the code's."""
+    true = Robot(diameter_m=SINGLE.diameter_m, markers=markers, code=code)
+    motion = line((0.1, -0.2, 0.2), tilt=(0.0, 0.0, 2.0))
+    arena = Arena({"b": true}, {"b": motion}, sigma_px=0.1, card_turn_rad=1.0)
+    found = find_stationary_markers(markers_of(arena))
+    R, p = motion(0.0)
+    order = [int(np.argmin(np.linalg.norm(p + true.points @ R.T - q, axis=1))) for q in found.position]
+    robot = robot_from_markers(found, true.diameter_m)
+    assert robot.codes == tuple(true.codes[k] for k in order)
+    turn = min((k for k in order if true.codes[k]), key=order.index) * arena.card_turn_rad
+    wanted = R @ rotation_from_vector([0.0, 0.0, turn])
+    measured = Arena({"b": robot}, {"b": motion}, arena.cameras)
+    measured.frames, measured.detect = arena.frames, arena.detect  # what the true robot shows
+    pose = track(measured, arena.frames(20))[-1].poses[0]
+    assert pose.state == "tracked"
+    x = rotation_from_wxyz(pose.quaternion_wxyz)[:, 0]
+    assert np.degrees(np.arccos(x @ wanted[:, 0])) < 1.5
+
+
 def test_a_side_of_unknown_normal_is_refused():
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1, 0.1], [-0.1, -0.1, 0.1], [0.0, 0.2, 0.0]])
     normals = np.array([[0, 0, 1.0], [0, 0, 1.0], [np.nan] * 3, [0, 1.0, 0]])
     with pytest.raises(FusionError, match="several sides, and the normals of 1 of 4 are not known: turn"):
-        robot_from_markers(StationaryMarkers(points, normals, np.full(4, np.nan)), 0.1)
+        robot_from_markers(plain(points, normals), 0.1)
 
 
 @pytest.mark.parametrize("turn", [1.0, -1.0])
 def test_z_is_up_where_no_normal_is_known(turn: float):
     """Planar markers without normals, in both orders around the plane's normal."""
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1 * turn, 0.1], [-0.1, -0.1 * turn, 0.1]])
-    robot = robot_from_markers(StationaryMarkers(points, UNKNOWN, NO_SIZE), 0.1)
+    robot = robot_from_markers(plain(points, UNKNOWN), 0.1)
     centred = points - points.mean(0)
     assert np.allclose(robot.points @ [1, 0, 0], centred[:, 0], atol=1e-4), "x along the first marker"
     assert np.allclose(robot.points @ [0, 1, 0], centred[:, 1], atol=1e-4), (
@@ -124,19 +159,17 @@ def test_z_is_up_where_no_normal_is_known(turn: float):
 def test_z_is_the_mean_normal_of_markers_that_are_not_planar():
     points = np.array([[0.2, 0.0, 0.1], [-0.1, 0.1, 0.0], [-0.1, -0.1, 0.0], [0.0, 0.0, 0.2]])
     normal = np.array([0.1, 0.0, 1.0]) / np.linalg.norm([0.1, 0.0, 1.0])
-    robot = robot_from_markers(StationaryMarkers(points, np.tile(normal, (4, 1)), np.full(4, np.nan)), 0.1)
+    robot = robot_from_markers(plain(points, np.tile(normal, (4, 1))), 0.1)
     height = (points - points.mean(0)) @ normal
     assert np.allclose(robot.points[:, 2], height, atol=1e-4)
 
 
 def test_markers_that_make_no_robot_are_refused():
-    nothing = StationaryMarkers(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    nothing = plain(np.empty((0, 3)), np.empty((0, 3)))
     with pytest.raises(FusionError, match="no stationary unlabeled marker found there; hold the robot still"):
         robot_from_markers(nothing, 0.1)
     with pytest.raises(FusionError, match=r"make no robot: .*one line"):
-        robot_from_markers(
-            StationaryMarkers(np.array([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]), UNKNOWN, NO_SIZE), 0.1
-        )
+        robot_from_markers(plain(np.array([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]), UNKNOWN), 0.1)
     assert len(find_stationary_markers([]).position) == 0
 
 

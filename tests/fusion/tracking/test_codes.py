@@ -90,9 +90,11 @@ def test_robots_that_are_exchanged_keep_their_names(until: float):
     assert after == 2 * sum(k * PERIOD_NS * 1e-9 > until + 0.1 for k in range(n))
 
 
+@pytest.mark.parametrize("card_turn_rad", [0.0, 2.0], ids=["aligned cards", "turned cards"])
 @pytest.mark.parametrize("markers", [TRIANGLE.markers, EQUILATERAL], ids=["identical", "symmetric"])
-def test_codes_tell_constellations_apart(markers: tuple):
-    """One marker of each has a code: neither starts nor different distances are needed."""
+def test_codes_tell_constellations_apart(markers: tuple, card_turn_rad: float):
+    """One marker of each has a code: neither starts nor different distances are needed. Cards of further markers may be
+    glued on at any turn."""
     robots = {
         "a": Robot(diameter_m=0.12, markers=markers, code=(3, 0, 0)),
         "b": Robot(diameter_m=0.12, markers=markers, code=(4, 5, 6)),
@@ -102,7 +104,7 @@ def test_codes_tell_constellations_apart(markers: tuple):
         "a": line((-0.5, 0.1, 0.2), (0.2, 0.0, 0.0), tilt=(0.05, 0.0, 2.0)),
         "b": line((0.4, 0.0, 0.3), (0.0, 0.2, 0.0), tilt=(0.0, 0.1, -1.0)),
     }
-    arena = Arena(robots, motions, sigma_px=0.05)
+    arena = Arena(robots, motions, sigma_px=0.05, card_turn_rad=card_turn_rad)
     sets = list(poses_of(arena, Tracker(arena.cameras, robots), 8))
     assert sum(len(poses) for poses in sets) >= 2 * 7
     for pose in (pose for poses in sets[2:] for pose in poses):
@@ -110,6 +112,20 @@ def test_codes_tell_constellations_apart(markers: tuple):
         assert off < 0.01
         assert abs(turned) < np.radians(2)
         assert pose.n_markers == 3
+
+
+def test_two_named_markers_are_enough_whatever_way_their_cards_are_turned():
+    robots = {"a": Robot(diameter_m=0.12, markers=EQUILATERAL, code=(3, 4, 5))}
+    motions = {"a": line((-0.2, 0.1, 0.2), (0.2, 0.0, 0.0), tilt=(0.05, 0.0, 2.0))}
+    arena = Arena(
+        robots, motions, sigma_px=0.05, card_turn_rad=2.0, hidden=lambda name, marker, t: marker == 0
+    )
+    sets = list(poses_of(arena, Tracker(arena.cameras, robots), 8))
+    assert sum(len(poses) for poses in sets) >= 7
+    for pose in (pose for poses in sets[2:] for pose in poses):
+        off, turned = errors(arena, pose)
+        assert off < 0.02
+        assert abs(turned) < np.radians(3)
 
 
 def test_a_name_that_was_not_read_leaves_the_robot_missing():
