@@ -10,7 +10,12 @@ from fusion.commands import COMMANDS, SERVER
 
 def main() -> None:
     """The entry point of `roundel-fusion`."""
-    run(lambda: run_program(COMMANDS, sys.argv[1:], SERVER, "roundel server"))
+    run(lambda: execute(sys.argv[1:]))
+
+
+def execute(arguments: list[str]) -> int | None:
+    """Run a command line."""
+    return run_program(COMMANDS, arguments, SERVER, "roundel server")
 
 
 if __name__ == "__main__":

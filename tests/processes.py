@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Programs in processes of their own. None outlasts its block, and none makes a test wait without a deadline."""
+"""Programs in processes of their own, of which none outlasts its block or makes a test wait without a deadline; and
+commands in this process."""
 
+import io
 import select
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from importlib import import_module
 from typing import Any
 
+from camera_node.foundation.program import exit_code
 from tests.conftest import ROOT
 from tests.waiting import DEADLINE_S
 
@@ -28,10 +32,17 @@ def running(module: str, *words: object, **options: Any) -> Iterator[subprocess.
         assert process.wait(DEADLINE_S) == 0
 
 
-def run_program(*words: object, timeout_s: float = DEADLINE_S) -> subprocess.CompletedProcess[str]:
-    """Run `python -m PROGRAM ...` to its end in a fresh process, as a user does."""
-    command = [sys.executable, "-m", *map(str, words)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
+def run_program(program: str, *words: object) -> subprocess.CompletedProcess[str]:
+    """The exit code of `python -m PROGRAM ...`, and what it prints but for its log: in this process, because a start of
+    Python takes longer than most commands."""
+    execute, out, err = import_module(f"{program}.__main__").execute, io.StringIO(), io.StringIO()
+    with chdir(ROOT), redirect_stdout(out), redirect_stderr(err):
+        try:
+            code = exit_code(lambda: execute([*map(str, words)]))
+        except SystemExit as end:  # of --help
+            code = end.code
+    assert isinstance(code, int)
+    return subprocess.CompletedProcess([program, *words], code, out.getvalue(), err.getvalue())
 
 
 @contextmanager

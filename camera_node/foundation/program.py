@@ -20,19 +20,23 @@ PERIOD_S = 10.0  # between two returns, each of which takes 0.2 to 3 ms on a thr
 
 
 def run(program: Callable[[], int | None]) -> NoReturn:
-    """Run a command and end the process with its code; a RoundelError is one line, with its own exit code."""
+    """Run a command and end the process with its code."""
     return_freed_memory()
+    end_process(exit_code(program))
+
+
+def exit_code(program: Callable[[], int | None]) -> int:
+    """Run a command and return its code; a RoundelError is one line on stderr, with its own exit code."""
     try:
-        code = program()
+        return program() or 0
     except RoundelError as error:
         print(f"error: {printable(error)}", file=sys.stderr)
-        code = error.exit_code
+        return error.exit_code
     except KeyboardInterrupt:
-        code = 130
+        return 130
     except BrokenPipeError:  # the reader closed the pipe, as in `detect --json | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 0
-    end_process(code or 0)
+        return 0
 
 
 def end_process(code: int) -> NoReturn:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`python -m calib` end to end: files in, a rig out; errors are one line and exit code 2."""
 
+import functools
 import json
 import resource
 import shutil
@@ -8,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,14 +19,14 @@ from camera_node.sources.recorded_detections import write_observations
 from tests.calib.boards import SPEC, board_poses, render
 from tests.calib.synthetic import Arena, assert_near, record, ring
 from tests.calib.world.landmarks import L_FRAME, detect_landmarks, in_another_world
+from tests.processes import run_program
 from tests.truth import true_camera
+from tests.waiting import DEADLINE_S
 
 WAND_YAML = "diameter_m: 0.12\nmarkers: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.5, 0.0, 0.0]]\n"
 
 
-def calib(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "calib", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)
+calib = functools.partial(run_program, "calib")
 
 
 @pytest.fixture
@@ -114,11 +114,12 @@ def test_a_full_disk_changes_no_file(tmp_path: Path, arena: Arena):
     """A limit of 1000 bytes per file acts like a full disk."""
     (tmp_path / "rig.yaml").write_text("precious")
     before = sorted(tmp_path.iterdir())
-    done = calib(
-        "wand",
-        *wand_options(tmp_path),
-        "--observations",
-        tmp_path / "observations.csv",
+    options = [*wand_options(tmp_path), "--observations", tmp_path / "observations.csv"]
+    done = subprocess.run(
+        [sys.executable, "-m", "calib", "wand", *map(str, options)],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
     )
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`roundel plan` as a process: text, JSON, reports, suggestions, rigs and mistakes."""
+"""`roundel plan` as a command: text, JSON, reports, suggestions, rigs and mistakes."""
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -18,21 +16,20 @@ from camera_node.foundation.command_line import parse
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import ConfigError
 from tests.conftest import ROOT
+from tests.processes import run_program
 
 SHIPPED = ROOT / "configs" / "plan.yaml"
 
 
-def plan(*options: str | Path, expected: int = 0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "calib", "plan", *map(str, options)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == expected, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
+def plan(*options: str | Path) -> str:
+    done = run_program("calib", "plan", *options)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_the_shipped_plan_as_text_and_as_a_page(tmp_path: Path):
     page = tmp_path / "plan.html"
-    text = plan(SHIPPED, "--report", page).stdout
+    text = plan(SHIPPED, "--report", page)
     assert f"north: level roundels of {load_yaml(SHIPPED, Plan).robots.diameter_m:g} m from" in text
     covered = re.search(r"two cameras or more see (\d+)% of the area", text)
     assert covered is not None
@@ -48,7 +45,7 @@ def test_the_result_of_a_rig_as_json_and_pdf(tmp_path: Path):
     cameras = {name: camera.camera() for name, camera in load_yaml(SHIPPED, Plan).cameras.items()}
     save_rig(Rig(cameras=cameras), tmp_path / "rig.yaml")
     pdf = tmp_path / "plan.pdf"
-    result = json.loads(plan("--rig", tmp_path / "rig.yaml", "--json", "--report", pdf).stdout)
+    result = json.loads(plan("--rig", tmp_path / "rig.yaml", "--json", "--report", pdf))
     assert set(result["cameras"]) == set(cameras)
     assert 0.3 < result["covered"] < result["covered"] + result["single"] <= 1.0
     grid = result["grid"]

@@ -3,13 +3,9 @@
 
 import subprocess
 import sys
-from functools import partial
 
 import pytest
 
-from camera_node.foundation.errors import ConfigError
-from camera_node.protocol.server_connection import Connection
-from fusion.commands.define import define
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots
 from tests.conftest import ROOT, free_port
@@ -22,22 +18,9 @@ def run_define(endpoint: str, *words: str) -> subprocess.CompletedProcess[str]:
     return run_program("fusion", "define", *words, "--connect", endpoint, "--arena", "test")
 
 
-def test_a_robot_is_replaced_on_request_only(tmp_path):
-    """Its name is refused before the measurement, and the declaration stays."""
-    with serving_an_unknown_robot(tmp_path) as (endpoint, client):
-        measure = partial(
-            define, "a", diameter=0.12, connection=Connection(connect=(endpoint,), arena="test")
-        )
-        before = client.declared_robots().robots["a"]
-        with pytest.raises(ConfigError, match="add --replace"):
-            measure()
-        assert client.declared_robots().robots["a"] == before
-        assert measure(seconds=1.0, replace=True) == 0
-        assert client.declared_robots().robots["a"] != before
-
-
-def test_a_robot_in_a_running_arena_is_defined(tmp_path):
-    """By the command, while the server tracks another one; the output is an entry for robots.yaml."""
+def test_a_robot_in_a_running_arena_is_defined_and_replaced_on_request_only(tmp_path):
+    """By the command, while the server tracks another one; the output is an entry for robots.yaml. A declared name is
+    refused before the measurement, and its declaration stays."""
     with serving_an_unknown_robot(tmp_path) as (endpoint, client):
         done = run_define(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
         assert done.returncode == 0, done.stderr
@@ -50,6 +33,13 @@ def test_a_robot_in_a_running_arena_is_defined(tmp_path):
         assert load_robots(path) == {"b": robots["b"]}
         with pytest.raises(FusionError, match="no robot 'c'"):
             client.change_robots(remove=["c"])
+        client.change_robots(remove=["b"])
+        refused = run_define(endpoint, "a", "--diameter", "0.12")
+        assert (refused.returncode, "add --replace" in refused.stderr) == (2, True)
+        assert client.declared_robots().robots == {"a": robots["a"]}
+        done = run_define(endpoint, "a", "--diameter", "0.12", "--seconds", "1", "--replace")
+        assert done.returncode == 0, done.stderr
+        assert client.declared_robots().robots["a"] != robots["a"]
 
 
 def test_a_misspelt_command_gets_a_suggestion():

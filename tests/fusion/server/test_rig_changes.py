@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A rig reaches the running server from a fresh process, or the command says why not and exits with 2."""
+"""A rig reaches the running server from a command, or the command says why not and exits with 2."""
 
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from fusion.protocol.pose_messages import FusedFrames, frames_key
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.arena_queries import RIG_ANSWERS_HZ
 from tests.calib.synthetic import assert_near, record, ring
-from tests.conftest import free_port
+from tests.conftest import ROOT, free_port
 from tests.fusion.serving import ARENA, KEYS, config, serving, serving_process
 from tests.fusion.unknown_robot import serving_an_unknown_robot
 from tests.processes import run_program
@@ -151,10 +151,12 @@ def test_without_a_server_commands_exit_with_2_and_one_line(tmp_path: Path):
         ("fusion", "define", "b", "--diameter", "0.12"),
     )
     where = to_server(f"tcp/127.0.0.1:{free_port()}")[1:]
-    with ThreadPoolExecutor() as pool:
-        for done in pool.map(lambda words: run_program(*words, *where), commands):
-            assert done.returncode == 2
-            (line,) = done.stderr.splitlines()
+    pipe = {"stderr": subprocess.PIPE, "text": True, "cwd": ROOT}
+    started = [subprocess.Popen([sys.executable, "-m", *words, *where], **pipe) for words in commands]
+    for process in started:
+        with process:
+            (line,) = process.communicate(timeout=DEADLINE_S)[1].splitlines()
+            assert process.returncode == 2
             assert "no server answers" in line
 
 
