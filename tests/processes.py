@@ -42,7 +42,7 @@ def run_program(program: str, *words: object) -> subprocess.CompletedProcess[str
         except SystemExit as end:  # of --help
             code = end.code
     assert isinstance(code, int)
-    return subprocess.CompletedProcess([program, *words], code, out.getvalue(), err.getvalue())
+    return subprocess.CompletedProcess([program, *map(str, words)], code, out.getvalue(), err.getvalue())
 
 
 @contextmanager
