@@ -12,21 +12,24 @@ import viser
 from web.condition import assess
 from web.html_tables import STYLE, status_line
 from web.scene.coverage_volume import CoverageVolume
+from web.shortcuts import Shortcuts
 from web.state.feed import ArenaState, Feed
 from web.state.recording_player import RecordingPlayer
 from web.state.subscription import Subscription
-from web.tabs.calibration_panels import CalibrationFiles, CalibrationInForce, RigHistoryPanel
+from web.tables import tabulate_robots
+from web.tabs.calibration_panels import CalibrationFiles, RigHistoryPanel, calibration_in_force
 from web.tabs.camera_tab import CameraSettings, CameraTable, LivePictures
 from web.tabs.graph_panel import GraphPanel
 from web.tabs.marker_picker import MarkerPicker
 from web.tabs.record_tab import Recorder, RecordingList, ReplayControls
-from web.tabs.robot_tab import RobotEditor, RobotTable
+from web.tabs.robot_selection import RobotSelection
+from web.tabs.robot_tab import RobotEditor
 from web.tabs.ruler import Ruler
 from web.tabs.status_tab import StatusTab
 from web.tabs.wand_session import WandSessionPanel
 from web.tabs.world_panel import WorldPanel
 from web.view import View
-from web.widgets import GREY, escape_markdown, set_content, set_property
+from web.widgets import GREY, StateText, escape_markdown, set_content, set_property
 
 TABS = ("Cameras", "Calibrate", "Robots", "Record", "Status")  # in the order of the work
 PANEL_PX = 440
@@ -38,6 +41,7 @@ class Header:
 
     Attributes:
         tabs: by the names in `TABS`; controls that are added in a `with` block of one are in that tab.
+        keys: the keys of the page.
         recording: the name of the recording that is shown in the place of the arena; empty for none.
         calibrating: returns what to do next in a calibration that began on this page; empty for none.
     """
@@ -67,6 +71,8 @@ class Header:
         group = gui.add_tab_group()
         self.tabs = {name: group.add_tab(name) for name in TABS}
         gui.add_button("Show the whole arena", color=GREY).on_click(lambda _: reset_view())
+        self.keys = Shortcuts(gui)
+        self.keys.add("V", "Show the whole arena", lambda _: reset_view())
 
     def update(self, state: ArenaState) -> None:
         """Show the condition of the arena, and the progress of the demo if it is recent."""
@@ -113,28 +119,31 @@ def add_live_page(
         closing.callback(settings.close)
         view.add(settings, is_live=True)
     with header.tabs["Calibrate"]:
-        view.add(CalibrationInForce(gui), is_live=True)
+        view.add(StateText(gui, calibration_in_force), is_live=True)
         if files is not None:
             panel = WandSessionPanel(view.server, subscription, files)
             view.add(panel, is_live=True)
             header.calibrating = panel.next_action
             closing.callback(panel.close)
+            header.keys.add("W", "Start or end a wand session", panel.session.toggle)
             view.add(WorldPanel(view.server, subscription, files), is_live=True)
         view.add(RigHistoryPanel(gui, subscription), is_live=True)
     with header.tabs["Robots"]:
-        view.add(RobotTable(gui))
-        view.add(RobotEditor(gui, subscription, folder), is_live=True)
+        selection = add_robots(view)
+        editor = RobotEditor(view.server, subscription, folder, selection)
+        view.add(editor, is_live=True)
+        header.keys.add("U", "Undo the change of a robot", editor.undo_button.run)
         view.add(MarkerPicker(view.server, subscription), is_live=True)
-        add_instruments(view)
+        add_instruments(view, selection, header.keys)
     with header.tabs["Record"]:
-        recorder = Recorder(gui, subscription, folder)
+        recorder = Recorder(view.server, header.tabs["Record"], subscription, folder)
+        header.keys.add("R", "Start or stop recording", recorder.action.toggle)
         closing.callback(recorder.close)
         view.add(recorder, is_live=True)
-        controls = ReplayControls(gui)
+        controls = add_replay_controls(view, header.keys)
         shown = ShownRecording(view, header, controls)
         closing.callback(shown.show, None)
-        view.add(RecordingList(gui, folder, shown.show, recorder), is_live=True)
-        view.add(controls)
+        view.add(RecordingList(view.server, folder, shown.show, recorder), is_live=True)
     with header.tabs["Status"]:
         view.add(StatusTab(gui, endpoint, view.feed.keys.arena), is_live=True)
 
@@ -168,17 +177,35 @@ def add_replay_page(view: View, player: RecordingPlayer) -> None:
     with header.tabs["Cameras"]:
         view.add(CameraTable(gui))
     with header.tabs["Robots"]:
-        view.add(RobotTable(gui))
-        add_instruments(view)
+        add_instruments(view, add_robots(view), header.keys)
     with header.tabs["Record"]:
-        view.add(ReplayControls(gui, player))
+        add_replay_controls(view, header.keys, player)
     with header.tabs["Status"]:
         view.add(StatusTab(gui, "", player.arena))
 
 
-def add_instruments(view: View) -> tuple[GraphPanel, Ruler]:
+def add_robots(view: View) -> RobotSelection:
+    """Add one row for each declared robot, and the selection of robots."""
+    view.add(StateText(view.server.gui, lambda state: tabulate_robots(state).html()))
+    selection = RobotSelection(view.server.gui)
+    view.robots.is_shown = selection.is_shown
+    view.add(selection)
+    return selection
+
+
+def add_instruments(view: View, selection: RobotSelection, keys: Shortcuts) -> Ruler:
     """Add what plots and measures, in the arena and in a recording."""
-    graph, ruler = GraphPanel(view.server.gui), Ruler(view.server)
-    view.add(graph, interval=1)
+    ruler = Ruler(view.server)
+    view.add(GraphPanel(view.server.gui, selection), interval=1)
     view.add(ruler, interval=1)
-    return graph, ruler
+    keys.add("M", "Measure a distance, or stop measuring", ruler.toggle)
+    return ruler
+
+
+def add_replay_controls(view: View, keys: Shortcuts, player: RecordingPlayer | None = None) -> ReplayControls:
+    """Add what pauses and moves a recording; hidden without one."""
+    controls = ReplayControls(view.server.gui, player)
+    view.add(controls)
+    keys.add("P", "Pause or play the recording", controls.pause)
+    keys.add("N", "Show the next frame of the recording", controls.step)
+    return controls

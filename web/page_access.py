@@ -42,7 +42,7 @@ MIN_TOKEN = 16  # characters
 MAX_CONNECTIONS = 768  # of 1,024 files that a process may open by default; the page needs some hundred itself
 MAX_OF_ADDRESS = 256  # connections of one machine or proxy; a browser has one, and six while it loads
 VIEWER_MESSAGES = frozenset({"ViewerCameraMessage"})  # the viewpoint of the browser itself
-OPERATOR_MESSAGES = VIEWER_MESSAGES | {"GuiUpdateMessage", "ScenePointerMessage"}
+OPERATOR_MESSAGES = VIEWER_MESSAGES | {"GuiUpdateMessage", "ScenePointerMessage", "CommandTriggerMessage"}
 HEADERS = {  # of each file: no other site may show the page in a frame, or learn its address
     "Content-Security-Policy": "frame-ancestors 'none'",
     "Referrer-Policy": "no-referrer",

@@ -13,6 +13,7 @@ from web.state.feed import ArenaState
 
 STALE_S = 2.0  # a robot or camera without a message for so long counts as absent
 NO_VALUE = "–"
+NO_ROBOT = "no robot yet"
 ROBOT_COLUMNS = (
     Column("robot", explanation="the dot has the robot's colour in the scene"),
     Column(

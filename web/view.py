@@ -58,7 +58,7 @@ class View:
         self._drawings = 0
         self._rig: Rig | None = None
         self.cameras = CameraDrawing(self.server.scene)
-        self._robots = RobotDrawing(self.server.scene)
+        self.robots = RobotDrawing(self.server.scene)
         self._markers = MarkerCloud(self.server.scene)
         self.discs = MarkerDiscs(self.server.scene)
         self.true_points = TruePoints(self.server.scene)
@@ -95,7 +95,7 @@ class View:
         with self.server.atomic():
             if state.rig is not self._rig:
                 self._draw_rig(state.rig)
-            self._robots.draw(state, is_slow=self._drawings % SLOW_INTERVAL == 0)
+            self.robots.draw(state, is_slow=self._drawings % SLOW_INTERVAL == 0)
             self._markers.draw(state)
             self.discs.draw(state)
             self.true_points.draw(state)

@@ -2,9 +2,12 @@
 """Controls that all tabs use: a line for outcomes, buttons that run one action at a time, buttons that ask again, and
 the decision on a result."""
 
+import contextlib
 import logging
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar, copy_context
 from typing import Any, Generic, TypeVar
 
 import viser
@@ -12,6 +15,7 @@ import viser
 from camera_node.foundation.errors import RoundelError
 from web.errors import WebError
 from web.html_tables import small
+from web.state.feed import ArenaState
 
 log = logging.getLogger("web")
 GREY, PRIMARY = (58, 63, 74), None  # colours of buttons; None is the theme's primary colour
@@ -19,6 +23,25 @@ Result = TypeVar("Result")
 # What is stored of a control and what is sent to browsers must have one order: two threads that set a property at once
 # would leave a browser with the value that the page no longer has, and that it therefore never sends again.
 _setting = threading.RLock()
+acting_browser: ContextVar[viser.ClientHandle | None] = ContextVar("acting_browser", default=None)
+REACTION_S = 1.0  # in which an operator cannot have seen that another one clicked first
+
+
+@contextlib.contextmanager
+def acting_for(client: viser.ClientHandle | None) -> Iterator[None]:
+    """Within the block a browser acts, or none for None."""
+    token = acting_browser.set(client)
+    try:
+        yield
+    finally:
+        acting_browser.reset(token)
+
+
+@contextlib.contextmanager
+def inside(container: Any) -> Iterator[None]:
+    """Within the block controls are added to a folder or tab, which Viser permits to one thread at a time."""
+    with _setting, container:
+        yield
 
 
 class Answer:
@@ -42,6 +65,17 @@ class Answer:
         except Exception as error:
             log.exception("the action %s failed", name)
             self.show(f"this failed: {type(error).__name__}: {error}", "bad")
+
+
+class StateText:
+    """HTML that follows the state of the arena."""
+
+    def __init__(self, gui: viser.GuiApi, write: Callable[[ArenaState], str]) -> None:
+        self._handle, self._write = gui.add_html(""), write
+
+    def update(self, state: ArenaState) -> None:
+        """Show the state."""
+        set_content(self._handle, self._write(state))
 
 
 class ActionButton:
@@ -75,7 +109,8 @@ class ActionButton:
         self.client = client
         self._show_disabled()
         try:
-            self._answer.show_outcome(self.handle.label, self._act)
+            with acting_for(client):
+                self._answer.show_outcome(self.handle.label, self._act)
         finally:
             self._running.release()
             self._show_disabled()
@@ -119,10 +154,15 @@ class ConfirmedButton(ActionButton):
 
     def show(self, enabled: bool = True, primary: bool = False, label: str = "") -> None:
         """As of `ActionButton`; the label says whether the next click acts."""
-        if self._asked is not None and self._asked[1] != self._subject():
+        if self._asked is not None and not self._is_asked(*self._asked):
             self._asked = None
         again = f"{self._label.split()[0]}: click again"
         super().show(enabled, primary, again if self._asked is not None else self._label)
+
+    def _is_asked(self, client: viser.ClientHandle | None, subject: str) -> bool:
+        with acting_for(client), contextlib.suppress(WebError):  # the subject is gone
+            return self._subject() == subject
+        return False
 
     def _ask(self) -> str:
         asked = self.client, self._subject()
@@ -154,8 +194,9 @@ class LongAction:
         self._lock, self._end = threading.Lock(), threading.Event()
         self._thread: threading.Thread | None = None
         self._closed = False
+        self._started: tuple[viser.ClientHandle | None, float] = None, 0.0
         self.handle = gui.add_button(labels[0], color=GREY)
-        self.handle.on_click(lambda _: self.toggle())
+        self.handle.on_click(lambda event: self.toggle(event.client))
 
     @property
     def is_running(self) -> bool:
@@ -167,15 +208,21 @@ class LongAction:
         """Whether the page closes: the action should save what it has, and end."""
         return self._closed
 
-    def toggle(self) -> None:
-        """Start the action, or end it."""
+    def toggle(self, client: viser.ClientHandle | None = None) -> None:
+        """Start the action for a browser, or end it; the click of another one at the same time does not end it."""
         with self._lock:
+            now_s = time.monotonic()
             if self.is_running:
-                self._end.set()
+                starter, since_s = self._started
+                if client is starter or now_s - since_s > REACTION_S:
+                    self._end.set()
                 return
             self._end.clear()
+            self._started = client, now_s
             set_property(self.handle, "label", self._labels[1])
-            self._thread = threading.Thread(target=self._run, name=self._labels[0], daemon=True)
+            with acting_for(client):
+                run = copy_context().run
+            self._thread = threading.Thread(target=run, args=[self._run], name=self._labels[0], daemon=True)
             self._thread.start()
 
     def show(self, enabled: bool, primary: bool = False) -> None:

@@ -66,8 +66,9 @@ def showing(feed: Feed, make: Callable[[View], Panel]) -> Iterator[tuple[View, P
 
 
 def value_of(view: View, label: str) -> Any:
-    """The value of the first control with a label, as the page's process has it."""
-    handles = view.server.gui._gui_input_handle_from_uuid.values()
+    """The value of the first control with a label, as the page's process has it; of a browser if it has its own."""
+    guis = [*(client.gui for client in view.server.get_clients().values()), view.server.gui]
+    handles = [handle for gui in guis for handle in list(gui._gui_input_handle_from_uuid.values())]
     return next(handle.value for handle in handles if getattr(handle, "label", None) == label)
 
 
@@ -95,7 +96,7 @@ def browsing(view: View, url: str = "") -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 1000, "height": 700})
-        page.set_default_timeout(1e3 * DEADLINE_S)
+        page.set_default_timeout(50e3)
         page.on("console", record)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(url or view.access.address)

@@ -56,7 +56,7 @@ def test_the_world_is_measured_shown_and_accepted(
     with showing(subscription.feed, make) as (view, panel):
         with pytest.raises(WebError, match="nothing to accept"):
             panel.decision.accept()
-        panel._by.value = BY_L_FRAME
+        panel._by.here.value = BY_L_FRAME
         with repeating(send, 0.1), browsing(view) as page:
             page.get_by_text("Floor and origin").click()
             for decision in ("Discard", "Accept"):
@@ -69,7 +69,7 @@ def test_the_world_is_measured_shown_and_accepted(
                 page.get_by_text("discarded" if decision == "Discard" else "the new world is").wait_for()
         true = rig.cameras["cam0"].matrix() @ np.linalg.inv(ARENA.truth.cameras["cam0"].matrix())
         assert origin == pytest.approx(true, abs=5e-3)
-        panel._by.value = STANDING
+        panel._by.here.value = STANDING
         files.wand.write_text(dump_yaml(l_frame))
         with pytest.raises(WebError, match="not a straight wand"):
             panel.measure()

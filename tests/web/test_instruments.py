@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The graph and the ruler of the tab Robots, in a real browser."""
 
+from collections import deque
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -14,7 +15,9 @@ from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import browsing, value_of
 from web.page import add_instruments
-from web.tabs.graph_panel import CAMERA_HEALTH, LENGTH_S, ROBOT, Quantity, graph
+from web.shortcuts import Shortcuts
+from web.tabs.graph_panel import CAMERA_HEALTH, LENGTH_S, ROBOT, Quantity, graph, label_lines
+from web.tabs.robot_selection import RobotSelection
 from web.tabs.ruler import Ruler, describe_distance
 from web.view import View
 
@@ -38,30 +41,42 @@ def test_the_graph_has_the_values_of_the_messages():
     expected = {
         "position, m": [1, 2, 3],
         "velocity, m/s": [0.1, 0.2, 0.3],
-        "heading, degrees": [30, np.nan, np.nan],
+        "heading, degrees": [30],
         "angular velocity, degrees/s": [0, 0, 90],
         "standard deviation of the position, mm": [1, 2, 3],
-        "residual, px": [np.nan] * 3,
-        "used": [3, 2, np.nan],
-        "latency, ms": [np.nan] * 3,
+        "residual, px": [np.nan],
+        "used": [3, 2],
+        "latency, ms": [np.nan],
     }
     assert [quantity.name for quantity in ROBOT] == list(expected)
     for quantity in ROBOT:
-        seconds, *columns = graph([(pose.t_ns, pose) for pose in (POSE, later)], quantity)
+        seconds, *columns = graph([deque((pose.t_ns, pose) for pose in (POSE, later))], quantity)
         np.testing.assert_allclose(seconds, [-1, 0])
         np.testing.assert_allclose([column[1] for column in columns], expected[quantity.name], rtol=1e-6)
     health = CameraHealth(
         fps=60, lateness_ms=4, residual_px=0.1, assigned=5, unassigned=6, late=0, calibrated=True
     )
-    found = [graph([(0, health), (1, health)], quantity)[1][1] for quantity in CAMERA_HEALTH]
+    found = [graph([deque([(0, health), (1, health)])], quantity)[1][1] for quantity in CAMERA_HEALTH]
     assert found == [60, 4, 0.1, 5]
 
 
 def test_the_graph_ends_with_the_newest_and_begins_half_a_minute_before():
-    samples = [(int(s * 1e9), SimpleNamespace(x=s)) for s in range(100)]
-    seconds, values, *_ = graph(samples, Quantity("x", ("x",), lambda sample: [sample.x]))
+    samples = deque((int(s * 1e9), SimpleNamespace(x=s)) for s in range(100))
+    seconds, values = graph([samples], Quantity("x", ("x",), lambda sample: [sample.x]))
     np.testing.assert_allclose(seconds, np.arange(-LENGTH_S, 1))
     np.testing.assert_allclose(values, 99 + seconds)
+
+
+def test_two_robots_are_plotted_over_one_time():
+    """The second one's stamps lie between the first one's; before its first sample it is unknown."""
+    t0 = 10**18
+    first = deque((t0 + k * 10**8, SimpleNamespace(x=float(k))) for k in range(5))
+    second = deque((t0 + k * 10**8 + 5 * 10**7, SimpleNamespace(x=10.0 * k)) for k in range(1, 4))
+    seconds, *columns = graph([first, second], Quantity("x", ("x",), lambda sample: [sample.x]))
+    np.testing.assert_allclose(seconds, [-0.4, -0.3, -0.25, -0.2, -0.15, -0.1, -0.05, 0.0], atol=1e-9)
+    np.testing.assert_allclose(columns[0], [0, 1, 1.5, 2, 2.5, 3, 3.5, 4], rtol=1e-6)
+    np.testing.assert_allclose(columns[1], [np.nan, np.nan, 10, 15, 20, 25, 30, np.nan], rtol=1e-6)
+    assert [line.get("label") for line in label_lines(("a", "b"), ("x", "y"))] == ["a x", "a y", "b x", "b y"]
 
 
 def test_the_distance_has_the_variance_along_it():
@@ -90,7 +105,7 @@ def instruments(arena: LiveArena, view: View) -> Iterator[Ruler]:
         arena.pose("rover", (0.5, 0.0, 0.1))
         arena.markers(SENT)
 
-    _, ruler = add_instruments(view)
+    ruler = add_instruments(view, RobotSelection(view.server.gui), Shortcuts(view.server.gui))
     with repeating(send, 0.05):
         yield ruler
 

@@ -16,7 +16,7 @@ from fusion.client.arena import Arena as Client
 from tests.fusion.synthetic import WIDE
 from tests.fusion.unknown_robot import WIDE_MOTION, serving_an_unknown_robot
 from tests.waiting import DEADLINE_S, wait_for
-from tests.web.browser import browsing, showing
+from tests.web.browser import browsing, showing, value_of
 from web.state.feed import Feed
 from web.state.subscription import Subscription
 from web.tabs.camera_tab import CameraTable
@@ -88,13 +88,14 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
         page.get_by_text("Black disc, mm").locator("xpath=ancestor::*[.//input][1]").locator("input").fill(
             "120"
         )
-        wait_for(lambda: (picker._name.value, picker._diameter.value) == ("wide", 120.0))
+        wait_for(lambda: (value_of(view, "Name"), value_of(view, "Black disc, mm")) == ("wide", 120.0))
         define = page.get_by_role("button", name="Define robot")
         click(define.click, page, re.compile("wide.* 3 markers"))
         wait_for(lambda: client.robot("wide", DEADLINE_S).next().state == "tracked")
         robot = client.change_robots()["wide"]
         client.change_robots(remove=["wide"])
-        picker._name.value = "all"
+        name.fill("all")
+        wait_for(lambda: value_of(view, "Name") == "all")
         everything = page.get_by_role("button", name="Define from everything stationary")
         click(everything.click, page, re.compile("all.* 3 markers"))
     assert robot.diameter_m == 0.12
@@ -118,10 +119,10 @@ def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicke
     refused(picker, "0.90, 0.90, 0.10 m")
     picker.selected = list(marker_positions())
     refused(picker, "measure about 120 mm, not 90 mm")
-    picker._diameter.value = 120.0
+    picker._diameter.here.value = 120.0
     picker.selected = list(marker_positions()[:2])
     refused(picker, "make no robot")
-    picker._name.value = "a/b"
+    picker._name.here.value = "a/b"
     refused(picker, "'a/b'")
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Draws robots and their trails with batched Viser handles, which cost 1/20 of single ones."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ class RobotDrawing:
     def __init__(self, scene: viser.SceneApi) -> None:
         self.scene = scene
         self.trails = Trails()
+        self.is_shown: Callable[[str], bool] = bool  # of a robot's name
         self._names: list[str] = []
         self._declared: dict[str, Robot] = {}
         self._axes: Any = None
@@ -49,7 +51,7 @@ class RobotDrawing:
 
     def draw(self, state: ArenaState, is_slow: bool) -> None:
         """Draw the latest poses; labels and trails change in slow drawings only, which cost ten times as much."""
-        names = sorted(state.poses)
+        names = sorted(filter(self.is_shown, state.poses))
         if names != self._names or state.declared is not self._declared:
             self._declared = state.declared
             self._create(names, *_poses(state, names))

@@ -33,16 +33,10 @@ MAX_LABEL = 48  # characters of a change on a button
 LEVELS = {"earlier": "wait", "in force": "ok", "undone": "warn"}
 
 
-class CalibrationInForce:
+def calibration_in_force(state: ArenaState) -> str:
     """One line on the calibration that the server uses: its grade, age and expected error, and what needs attention."""
-
-    def __init__(self, gui: viser.GuiApi) -> None:
-        self._line = gui.add_html("")
-
-    def update(self, state: ArenaState) -> None:
-        """Show the state."""
-        problems = calibration_problems(assess_calibration(state.rig, datetime.now(UTC)))
-        set_content(self._line, small(describe_rig(state.rig), "warn" if problems else "ok"))
+    problems = calibration_problems(assess_calibration(state.rig, datetime.now(UTC)))
+    return small(describe_rig(state.rig), "warn" if problems else "ok")
 
 
 def describe_rig(rig: Rig | None) -> str:

@@ -4,8 +4,10 @@
 import base64
 import html
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from contextvars import copy_context
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +22,7 @@ from camera_node.protocol.registration import CameraChange
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import guarded
 from web.html_tables import MARGIN_PX
+from web.own_control import OwnControl, each_browser
 from web.scene.camera_frustums import CameraDrawing
 from web.state.coverage_picture import montage
 from web.state.feed import ArenaState
@@ -28,9 +31,17 @@ from web.tables import STALE_S, tabulate_cameras
 from web.tabs.calibration_panels import CalibrationFiles
 from web.tabs.lens_panel import LensPanel
 from web.tabs.mask_editor import MaskEditor
-from web.widgets import ActionButton, Answer, ConfirmedButton, set_content, set_property
+from web.widgets import ActionButton, Answer, ConfirmedButton, inside, set_content, set_property
 
 NO_CAMERA = "no camera yet"
+FIELDS: tuple[Callable[[viser.GuiApi], Any], ...] = (  # name, exposure, gain, contrast
+    lambda gui: gui.add_text("Rename to", "", hint="in the rig, in files and on the network"),
+    lambda gui: gui.add_number("Exposure, us", 0.0, min=0.0, max=1e6, step=1.0),
+    lambda gui: gui.add_number("Gain", 0.0, min=0.0, max=1e6, step=0.1, hint="in the driver's units"),
+    lambda gui: gui.add_number(
+        "Contrast", 25.0, min=5.0, max=250.0, step=1.0, hint="least contrast of a roundel, grey levels"
+    ),
+)
 RETURNS = "; a camera that still runs registers again when it is restarted"
 
 
@@ -110,21 +121,13 @@ class CameraSettings:
         files: CalibrationFiles | None = None,
     ) -> None:
         gui = server.gui
-        self._gui, self._subscription = gui, subscription
-        self._shown = ""  # camera whose settings are in the fields
-        self._folder = gui.add_folder("One camera")
-        with self._folder:
-            self._camera = gui.add_dropdown("Camera", [NO_CAMERA])
-            self._new_name = gui.add_text("Rename to", "", hint="in the rig, in files and on the network")
-            self._exposure = gui.add_number("Exposure, us", 0.0, min=0.0, max=1e6, step=1.0)
-            self._gain = gui.add_number("Gain", 0.0, min=0.0, max=1e6, step=0.1, hint="in the driver's units")
-            self._contrast = gui.add_number(
-                "Contrast",
-                25.0,
-                min=5.0,
-                max=250.0,
-                step=1.0,
-                hint="least contrast of a roundel, grey levels",
+        self._server, self._subscription = server, subscription
+        self._shown: dict[int, str] = {}  # by browser: the camera whose settings are in its fields
+        self._folder = place = gui.add_folder("One camera")
+        with place:
+            self._camera = OwnControl(server, place, lambda gui: gui.add_dropdown("Camera", [NO_CAMERA]))
+            self._new_name, self._exposure, self._gain, self._contrast = (
+                OwnControl(server, place, add) for add in FIELDS
             )
             answer = Answer(gui)
             self._forget = ConfirmedButton(
@@ -144,21 +147,23 @@ class CameraSettings:
             )
             self._image: viser.GuiImageHandle | None = None
             self._mask = MaskEditor(server, subscription, lambda: self._name, self._request_picture)
-            self._lens = LensPanel(gui, subscription, files, lambda: self._name) if files else None
+            self._lens = LensPanel(server, subscription, files, lambda: self._name) if files else None
 
     def update(self, state: ArenaState) -> None:
         """Offer the cameras that publish."""
         of_server = state.status.message.cameras if state.status else {}
-        names = tuple(sorted({*state.cameras, *of_server})) or (NO_CAMERA,)
-        if names != tuple(self._camera.options):
-            self._camera.options = names
+        names = tuple(sorted({*state.cameras, *of_server}))
+        self._camera.offer(names, NO_CAMERA)
         for button in self._buttons:
             button.show(enabled=bool(state.cameras))
-        self._forget.show(enabled=names != (NO_CAMERA,))
-        if self._name in state.cameras and self._name != self._shown:
-            self._shown = self._name
-            show = guarded("the settings of a camera", self._show_present)
-            threading.Thread(target=show, args=[self._name], name="settings", daemon=True).start()
+        self._forget.show(enabled=bool(names))
+        show = guarded("the settings of a camera", self._show_present)
+        for client in each_browser(self._server):
+            name = str(self._camera.here.value)
+            if name in state.cameras and name != self._shown.get(client.client_id):
+                self._shown[client.client_id] = name
+                run = copy_context().run
+                threading.Thread(target=run, args=[show, name], name="settings", daemon=True).start()
         self._mask.update(state)
         if self._lens is not None:
             self._lens.update(state)
@@ -170,10 +175,10 @@ class CameraSettings:
 
     def rename(self) -> str:
         """Have the server rename the camera, in the rig too. Raises ConfigError, RequestError or NetworkError."""
-        old, new = self._name, str(self._new_name.value).strip()
+        old, new = self._name, str(self._new_name.here.value).strip()
         require_name(new, "a camera")
         self._change(CameraChange(camera=old, name=new, source=RequestSource.of("web")))
-        self._new_name.value = ""
+        self._new_name.here.value = ""
         return f"{old} is called {new} from now on"
 
     def forget(self) -> str:
@@ -190,7 +195,7 @@ class CameraSettings:
         """Fill the fields with the settings of a camera that was selected."""
         with suppress(RoundelError):  # the button shows why it does not answer
             used = self._subscription.change_settings(name)
-            if name == self._name:
+            if name == self._camera.here.value:
                 self._show(used)
 
     def read(self) -> str:
@@ -200,19 +205,20 @@ class CameraSettings:
     def apply(self) -> str:
         """Change exposure, gain and contrast."""
         wanted = Settings(
-            exposure_us=self._exposure.value or None,
-            gain=self._gain.value or None,
-            min_contrast=self._contrast.value,
+            exposure_us=self._exposure.here.value or None,
+            gain=self._gain.here.value or None,
+            min_contrast=self._contrast.here.value,
         )
         return self._show(self._subscription.change_settings(self._name, wanted))
 
     @property
     def _name(self) -> str:
-        return str(self._camera.value)
+        return self._camera.chosen
 
     def _show(self, used: Settings) -> str:
-        self._exposure.value, self._gain.value = used.exposure_us or 0.0, used.gain or 0.0
-        self._contrast.value = used.min_contrast or self._contrast.value
+        contrast = self._contrast.here
+        self._exposure.here.value, self._gain.here.value = used.exposure_us or 0.0, used.gain or 0.0
+        contrast.value = used.min_contrast or contrast.value
         exposure = "automatic" if used.exposure_us is None else f"{used.exposure_us:.0f} us"
         return f"{self._name}: exposure {exposure}, {len(used.mask or ())} masked places"
 
@@ -221,8 +227,8 @@ class CameraSettings:
         image = self._request_picture(name)
         if self._image is not None:
             self._image.remove()
-        with self._folder:
-            self._image = self._gui.add_image(image, format="jpeg")
+        with inside(self._folder):
+            self._image = self._server.gui.add_image(image, format="jpeg")
         return f"{name}, {image.shape[1]} x {image.shape[0]}"
 
     def _request_picture(self, name: str) -> NDArray[np.uint8]:

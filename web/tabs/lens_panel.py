@@ -5,6 +5,7 @@ in a terminal."""
 import math
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import takewhile
@@ -21,14 +22,17 @@ from calib.intrinsics.lens_calibration import BoardViews, CalibratedLens, Model,
 from calib.intrinsics.residual_plot import draw_residuals
 from calib.rig.coverage import Coverage
 from calib.rig.rig import Rig
+from web.errors import WebError
 from web.html_tables import COLOURS, MARGIN_PX, small
+from web.own_control import OwnControl, each_browser
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
-from web.widgets import Answer, Decision, LongAction, set_content
+from web.widgets import Answer, Decision, LongAction, inside, set_content
 
 BOARD = "charuco:5x7:0.035"  # of `roundel print board`
 MODELS = ("pinhole", "fisheye")
+WIDE = "fisheye for lenses beyond 120 degrees"
 CAPTURE_S = 180.0
 CLOSE_S = 5.0
 CORNERS_PER_SHADE, SHADES = 8, 4  # of a cell, by the logarithm of its number of corners
@@ -42,7 +46,7 @@ class LensPanel:
     """The folder "Lens" of the selected camera.
 
     Args:
-        gui: where the controls are added.
+        server: of the page.
         subscription: connected to the arena.
         files: the rig in which the lens is saved.
         camera: returns the name of the selected camera.
@@ -50,17 +54,18 @@ class LensPanel:
 
     def __init__(
         self,
-        gui: viser.GuiApi,
+        server: viser.ViserServer,
         subscription: Subscription,
         files: CalibrationFiles,
         camera: Callable[[], str],
     ) -> None:
-        self._gui, self._subscription, self._files, self._camera = gui, subscription, files, camera
-        self._folder = gui.add_folder("Lens")
-        with self._folder:
-            self._state = gui.add_html("")
-            self._board = gui.add_text("Board", BOARD, hint=BOARD_HINT)
-            self._model = gui.add_dropdown("Model", MODELS, hint="fisheye for lenses beyond 120 degrees")
+        self._server, self._subscription, self._files, self._camera = server, subscription, files, camera
+        gui = server.gui
+        self._folder = place = gui.add_folder("Lens")
+        with place:
+            self._state = OwnControl(server, place, lambda gui: gui.add_html(""))
+            self._board = OwnControl(server, place, lambda gui: gui.add_text("Board", BOARD, hint=BOARD_HINT))
+            self._model = OwnControl(server, place, lambda gui: gui.add_dropdown("Model", MODELS, hint=WIDE))
             self._answer = answer = Answer(gui)
             self._capture = LongAction(gui, LABELS, self._calibrate, answer)
             self._cells = gui.add_html("")
@@ -69,22 +74,23 @@ class LensPanel:
 
     def update(self, state: ArenaState) -> None:
         """Show the lens of the selected camera, and enable the buttons that can act."""
-        name = self._camera()
-        set_content(self._state, small(describe_lens(state.rig, name)))
-        self._capture.show(enabled=name in state.cameras)
+        for _ in each_browser(self._server):
+            with suppress(WebError):  # the camera was renamed or forgotten
+                set_content(self._state.here, small(describe_lens(state.rig, self._camera())))
+        self._capture.show(enabled=bool(state.cameras))
         self.decision.show(enabled=not self._capture.is_running)
 
-    def _use(self, candidate: tuple[str, CalibratedLens]) -> str:
+    def _use(self, candidate: tuple[str, CalibratedLens, str]) -> str:
         """Write the lens into the rig, and have the server use it; the camera's pose becomes void.
 
         Raises:
             CalibrationError, ConfigError: the rig can't be read or written.
         """
-        name, lens = candidate
+        name, lens, board = candidate
         provenance = {
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "command": "the page",
-            "board": str(self._board.value),
+            "board": board,
         }
         rig = merge_lenses(current_rig(self._subscription, self._files), {name: lens}, provenance)
         outcome = apply_rig(self._subscription, self._files, rig)
@@ -104,9 +110,9 @@ class LensPanel:
     def _calibrate(self, end: threading.Event) -> str:
         """Capture views until they suffice or the user ends it; returns the figures of the lens."""
         self.decision.clear()
-        name = self._camera()
-        model: Model = "fisheye" if self._model.value == "fisheye" else "pinhole"
-        views = BoardViews(name, make_finder(str(self._board.value)))
+        name, board = self._camera(), str(self._board.here.value)
+        model: Model = "fisheye" if self._model.here.value == "fisheye" else "pinhole"
+        views = BoardViews(name, make_finder(board))
         session, arena = self._subscription.session, self._subscription.feed.keys.arena
         images = takewhile(lambda _: not end.is_set(), take_snapshots(session, arena, name, CAPTURE_S))
         reason = capture_views(views, images, model, self._show)
@@ -115,7 +121,7 @@ class LensPanel:
         self._capture.handle.disabled = True
         self._answer.show(f"{reason}; calibrating")
         lens = replace(views.solve(model), better_model=views.compare_models(model))
-        self.decision.result = name, lens
+        self.decision.result = name, lens, board
         self._show_residuals(name, lens)
         return summarize_lens(name, lens)
 
@@ -125,9 +131,9 @@ class LensPanel:
 
     def _show_residuals(self, name: str, lens: CalibratedLens) -> None:
         drawn = draw_residuals(name, lens.camera, lens.observed(), lens.residuals())
-        with self._folder:
+        with inside(self._folder):
             picture = np.ascontiguousarray(cv2.cvtColor(drawn, cv2.COLOR_BGR2RGB), np.uint8)
-            self._residuals = self._gui.add_image(picture, label="residuals", format="jpeg")
+            self._residuals = self._server.gui.add_image(picture, label="residuals", format="jpeg")
 
 
 def draw_cells(coverage: Coverage) -> str:

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Defines a new robot from markers that the user selects in the page; `roundel define` does so without one."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +21,7 @@ from fusion.errors import FusionError
 from web.colours import SELECTED
 from web.condition import next_step
 from web.html_tables import small
+from web.own_control import OwnControl
 from web.scene.clicks import nearest_to_ray
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
@@ -27,6 +31,11 @@ MARKERS_S = 1.0  # age up to which the latest markers can be selected
 MEASURE_S = 1.5  # for which the markers of the new robot are measured
 SAME_M = 0.05  # distance up to which a measured marker is the selected one
 NOTHING_SEEN = "no unlabeled marker in view: place the robot, markers up, where two cameras see it"
+FIELDS: tuple[Callable[[viser.GuiApi], Any], ...] = (  # name, diameter, motion
+    lambda gui: gui.add_text("Name", "robot"),
+    lambda gui: gui.add_number("Black disc, mm", 90.0, min=1.0, max=10_000.0, step=0.1),
+    lambda gui: gui.add_dropdown("Motion", ("aerial", "ground")),
+)
 SELECT, STOP = "Select markers", "Stop selecting"
 
 
@@ -38,12 +47,11 @@ class MarkerPicker:
         self._subscription = subscription
         self._unlabeled = np.empty((0, 3))  # current positions of unlabeled markers that several cameras see
         self._active = False
-        with server.gui.add_folder("New robot"):
+        place = server.gui.add_folder("New robot")
+        with place:
             self._seen = server.gui.add_html(small(NOTHING_SEEN))
             self._button = server.gui.add_button(SELECT, color=GREY)
-            self._name = server.gui.add_text("Name", "robot")
-            self._diameter = server.gui.add_number("Black disc, mm", 90.0, min=1.0, max=10_000.0, step=0.1)
-            self._motion = server.gui.add_dropdown("Motion", ("aerial", "ground"))
+            self._name, self._diameter, self._motion = (OwnControl(server, place, add) for add in FIELDS)
             self._answer = Answer(server.gui)
             self._define_selected = ActionButton(
                 server.gui,
@@ -104,8 +112,7 @@ class MarkerPicker:
         Raises:
             RoundelError: the name can't be one or is in use, a marker moves, or the server does not answer.
         """
-        name = self._name.value
-        require_name(name, "a robot")
+        name = require_name(self._name.here.value, "a robot")
         if not self.selected:
             raise FusionError("no marker is selected")
         measured = find_stationary_markers(self._subscription.collect_markers(MEASURE_S))
@@ -114,11 +121,11 @@ class MarkerPicker:
 
     def define_stationary(self) -> str:
         """Have the server track a robot of all stationary unlabeled markers; returns and raises as `define`."""
-        name = require_name(self._name.value, "a robot")
+        name = require_name(self._name.here.value, "a robot")
         return self._define(name, find_stationary_markers(self._subscription.collect_markers(MEASURE_S)))
 
     def _define(self, name: str, markers: StationaryMarkers) -> str:
-        robot = robot_from_markers(markers, self._diameter.value / 1e3, self._motion.value)
+        robot = robot_from_markers(markers, self._diameter.here.value / 1e3, self._motion.here.value)
         robots = self._subscription.define(name, robot)
         self.selected = []
         return describe(name, robots)

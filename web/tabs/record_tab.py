@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import viser
 
@@ -22,6 +23,7 @@ from fusion.recordings.recording_files import (
 from web.commands import run_program
 from web.errors import WebError
 from web.html_tables import Column, HtmlTable, TableRow
+from web.own_control import OwnControl
 from web.state.feed import ArenaState
 from web.state.recording_player import RecordingPlayer
 from web.state.subscription import Subscription
@@ -29,6 +31,7 @@ from web.widgets import ActionButton, Answer, ConfirmedButton, LongAction, set_c
 
 LIST_INTERVAL = 9  # updates from one look at the folder to the next: about 3 s
 NO_RECORDING = "no recording yet"
+NAME_HINT = "of the file; empty for date and time"
 CLOSE_S = 5.0  # for a recording to be completed when the page closes
 RECORDING_COLUMNS = (
     Column("recording"),
@@ -47,13 +50,14 @@ STEP_S = 1 / 30  # of the button Step
 class Recorder:
     """Records the arena into a new file of a folder; `roundel record` does so without a page."""
 
-    def __init__(self, gui: viser.GuiApi, subscription: Subscription, folder: Path) -> None:
+    def __init__(self, server: viser.ViserServer, tab: Any, subscription: Subscription, folder: Path) -> None:
+        gui = server.gui
         self._subscription, self._folder = subscription, folder
         self._lock = threading.Lock()
         self._written: tuple[RecordingWriter, ArenaRecorder] | None = None
-        self._name = gui.add_text("Name", "", hint="of the file; empty for date and time")
+        self._name = OwnControl(server, tab, lambda gui: gui.add_text("Name", "", hint=NAME_HINT))
         self._answer = Answer(gui)
-        self._action = LongAction(gui, ("Start recording", "Stop recording"), self._record, self._answer)
+        self.action = LongAction(gui, ("Start recording", "Stop recording"), self._record, self._answer)
 
     @property
     def written(self) -> Path | None:
@@ -63,18 +67,20 @@ class Recorder:
 
     def update(self, state: ArenaState) -> None:
         """Show the progress."""
-        self._action.show(enabled=state.server_alive)
+        self.action.show(enabled=state.server_alive)
         with self._lock:  # so that the outcome is shown last
             if self._written is not None:
                 self._answer.show(_describe("recording", *self._written), "warn")
 
     def close(self) -> None:
         """Complete the recording."""
-        self._action.close(CLOSE_S)
+        self.action.close(CLOSE_S)
 
     def _record(self, end: threading.Event) -> str:
         """Record until `end`; returns the outcome. Raises ConfigError if the file exists or can't be written."""
-        path = recording_path(self._folder, self._name.value or datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+        path = recording_path(
+            self._folder, self._name.here.value or datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        )
         self._folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
             raise ConfigError(f"{path} exists; give another name")
@@ -99,32 +105,40 @@ class RecordingList:
     """The recordings of a folder; the selected one can be played in the place of the arena, exported, renamed, deleted.
 
     Args:
-        gui: where the controls are added.
+        server: of the page.
         folder: the folder.
         show: plays a recording in the page, or shows the arena again for None.
         recorder: which may be writing one of them.
     """
 
     def __init__(
-        self, gui: viser.GuiApi, folder: Path, show: Callable[[Path | None], None], recorder: Recorder
+        self,
+        server: viser.ViserServer,
+        folder: Path,
+        show: Callable[[Path | None], None],
+        recorder: Recorder,
     ) -> None:
+        gui = server.gui
         self._folder, self._show, self._recorder = folder, show, recorder
-        self._updates = 0
+        self._updates, self._is_any = 0, False
         self._shown: Path | None = None
-        with gui.add_folder("Recordings"):
+        place = gui.add_folder("Recordings")
+        with place:
             self._table = gui.add_html("")
-            self._selected = gui.add_dropdown("Recording", [NO_RECORDING])
+            self._selected = OwnControl(
+                server, place, lambda gui: gui.add_dropdown("Recording", [NO_RECORDING])
+            )
             answer = Answer(gui)
             self._replay = ActionButton(gui, "Replay", self.replay, answer)
             self._live = ActionButton(gui, "Back to the arena", self.back, answer)
             hint = "fuses the recording again and writes poses as CSV beside it"
             self._export = ActionButton(gui, "Export poses", self.export, answer, hint)
-            self._new_name = gui.add_text("New file name", "", hint="of the selected recording")
+            self._new_name = OwnControl(server, place, lambda gui: gui.add_text("New file name", ""))
             self._rename = ActionButton(gui, "Rename the recording", self.rename, answer)
             self._delete = ConfirmedButton(
                 gui,
                 "Delete the recording",
-                lambda: str(self._selected.value),
+                lambda: self._selected.chosen,
                 self.delete,
                 answer,
                 " for good",
@@ -136,9 +150,8 @@ class RecordingList:
         if self._updates % LIST_INTERVAL == 0:
             self._list()
         self._updates += 1
-        is_any = self._selected.value != NO_RECORDING
         for button in (self._replay, self._export, self._rename, self._delete):
-            button.show(enabled=is_any)
+            button.show(enabled=self._is_any)
         self._live.show(enabled=self._shown is not None, primary=self._shown is not None)
 
     def replay(self) -> str:
@@ -162,9 +175,10 @@ class RecordingList:
     def rename(self) -> str:
         """Give the selected recording another name."""
         old = self._release()
-        new = rename_recording(old, str(self._new_name.value).strip())
-        self._new_name.value = ""
+        new = rename_recording(old, str(self._new_name.here.value).strip())
+        self._new_name.here.value = ""
         self._list()
+        self._selected.here.value = new.name
         return f"{old.name} is called {new.name} from now on"
 
     def delete(self) -> str:
@@ -186,15 +200,14 @@ class RecordingList:
     def _list(self) -> None:
         found = list_recordings(self._folder)
         set_content(self._table, tabulate_recordings(found).html())
-        names = tuple(summary.path.name for summary in found) or (NO_RECORDING,)
-        if names != tuple(self._selected.options):
-            self._selected.options = names
+        self._is_any = bool(found)
+        self._selected.offer([summary.path.name for summary in found], NO_RECORDING)
 
     @property
     def _path(self) -> Path:
         """The selected recording; a browser may send any text, and only recordings of the folder are used."""
-        name = str(self._selected.value)
-        if name not in self._selected.options or name == NO_RECORDING:
+        name = self._selected.chosen
+        if name not in self._selected.here.options or name == NO_RECORDING:
             raise ConfigError("no recording of this name is in the folder; select one of the list")
         return self._folder / name
 
@@ -246,8 +259,8 @@ class ReplayControls:
             self._save = ActionButton(
                 gui, "Save the part as a recording", self.save_part, answer, "beside the recording"
             )
-        self._button.on_click(lambda _: self._with(lambda player: player.play(not player.playing)))
-        step.on_click(lambda _: self._with(lambda player: player.step(STEP_S)))
+        self._button.on_click(self.pause)
+        step.on_click(self.step)
         self._speed.on_update(lambda _: self._with(lambda player: player.set_speed(float(self._speed.value))))
         self._position.on_update(self._seek)
         self._part.on_update(self._select_part)
@@ -270,6 +283,14 @@ class ReplayControls:
         set_property(self._part, "value", tuple(round(s, 1) for s in player.part_s))
         self._save.show(enabled=player.part_s != (0.0, player.duration_s))
         set_property(self._position, "value", round(min(seconds, player.duration_s), 1))
+
+    def pause(self, _: object) -> None:
+        """Pause, or play."""
+        self._with(lambda player: player.play(not player.playing))
+
+    def step(self, _: object) -> None:
+        """Show the next frame."""
+        self._with(lambda player: player.step(STEP_S))
 
     def save_part(self) -> str:
         """Write the part that is played as a recording of its own, beside the recording.

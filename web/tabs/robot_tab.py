@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The tab Robots: all declared robots with their state, why a robot is not tracked, and changes of one robot."""
+"""The tab Robots: changes of declared robots, and how they are undone."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,26 +9,19 @@ from pathlib import Path
 import viser
 
 from camera_node.foundation.config import require_name
+from camera_node.foundation.errors import printable
 from fusion.errors import FusionError
 from fusion.model.robots import Robot, move_origin, save_robots, turn_heading
 from fusion.protocol.pose_messages import Robots, RobotsRequest
+from web.own_control import OwnControl
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
-from web.tables import tabulate_robots
-from web.widgets import ActionButton, Answer, ConfirmedButton, set_content
+from web.tables import NO_ROBOT
+from web.tabs.calibration_panels import MAX_LABEL
+from web.tabs.robot_selection import RobotSelection
+from web.widgets import ActionButton, Answer, ConfirmedButton
 
-NO_ROBOT = "no robot yet"
-
-
-class RobotTable:
-    """One row for each declared robot."""
-
-    def __init__(self, gui: viser.GuiApi) -> None:
-        self._table = gui.add_html("")
-
-    def update(self, state: ArenaState) -> None:
-        """Show the state."""
-        set_content(self._table, tabulate_robots(state).html())
+UNDO = "Undo the change of a robot"
 
 
 def _numbered(path: Path) -> Iterator[Path]:
@@ -44,89 +37,97 @@ class RobotChange:
     Attributes:
         about: the change in words.
         undo: the request that reverts it.
-        name, after: the robot that it left, None if it deleted the robot.
+        after: the robots that it left, None for one that it deleted.
     """
 
     about: str
     undo: RobotsRequest
-    name: str
-    after: Robot | None
+    after: dict[str, Robot | None]
 
 
 class RobotEditor:
     """Renames, deletes and saves robots, and changes their frames; undoes these changes, the latest first.
 
     Args:
-        gui: where the controls are added.
+        server: of the page.
         subscription: connected to the arena.
         folder: where "Save" writes robots.yaml.
+        selection: the robots that are deleted together.
     """
 
-    def __init__(self, gui: viser.GuiApi, subscription: Subscription, folder: Path) -> None:
-        self._subscription, self._file = subscription, folder / "robots.yaml"
+    def __init__(
+        self, server: viser.ViserServer, subscription: Subscription, folder: Path, selection: RobotSelection
+    ) -> None:
+        self._subscription, self._file, self._selection = subscription, folder / "robots.yaml", selection
         self._changes: list[RobotChange] = []
-        with gui.add_folder("One robot", expand_by_default=False):
-            self._robot = gui.add_dropdown("Robot", [NO_ROBOT])
-            self._name = gui.add_text("New name", "")
-            self._pivot = gui.add_vector3(
-                "Pivot, m", (0.0, 0.0, 0.0), step=0.001, hint="the new origin in the robot's present frame"
-            )
-            self._degrees = gui.add_number(
-                "Turn, degrees", 90.0, step=1.0, hint="of the x axis, counterclockwise seen from above"
-            )
-            answer = Answer(gui)
-            self._delete = ConfirmedButton(gui, "Delete", lambda: str(self._robot.value), self.delete, answer)
-            self._others = (
+        gui, answer = server.gui, Answer(server.gui)
+        place = gui.add_folder("One robot", expand_by_default=False)
+        with place:
+            self._robot = OwnControl(server, place, lambda gui: gui.add_dropdown("Robot", [NO_ROBOT]))
+            self._name = OwnControl(server, place, lambda gui: gui.add_text("New name", ""))
+            self._pivot = OwnControl(server, place, _add_pivot)
+            self._degrees = OwnControl(server, place, _add_degrees)
+            self._one = (
+                ConfirmedButton(gui, "Delete", lambda: self._robot.chosen, self.delete, answer),
                 ActionButton(gui, "Rename", self.rename, answer),
                 ActionButton(gui, "Move the pivot", self.move_pivot, answer, "the robot is acquired again"),
                 ActionButton(gui, "Turn the heading", self.turn, answer, "the robot is acquired again"),
-                ActionButton(gui, "Save all robots", self.save, answer, f"writes {self._file}"),
             )
-            self._undo = ActionButton(gui, "Undo the change of a robot", self.undo, answer)
+        with selection.folder:
+            self._delete = ConfirmedButton(
+                gui, "Delete the selected robots", lambda: ", ".join(selection.names), self.delete_all, answer
+            )
+        self._save = ActionButton(gui, "Save all robots", self.save, answer, f"writes {self._file}")
+        self.undo_button = ActionButton(gui, UNDO, self.undo, answer)
 
     def update(self, state: ArenaState) -> None:
-        """Offer the declared robots."""
-        names = state.declared_robots()
-        if (names or (NO_ROBOT,)) != tuple(self._robot.options):
-            self._robot.options = names or (NO_ROBOT,)
-        for button in (self._delete, *self._others):
+        """Offer the declared robots, and say which change would be undone."""
+        names = sorted(state.declared)  # a status of before the latest change has other ones
+        self._robot.offer(names, NO_ROBOT)
+        for button in (*self._one, self._save):
             button.show(enabled=bool(names))
-        self._undo.show(enabled=bool(self._changes))
+        self._delete.show(enabled=bool(self._selection.names))
+        last = f": {printable(self._changes[-1].about, MAX_LABEL)}" if self._changes else ""
+        self.undo_button.show(enabled=bool(self._changes), label=UNDO + last)
 
     def rename(self) -> str:
         """Rename the robot; it stays tracked."""
-        old, new = str(self._robot.value), require_name(self._name.value, "a robot")
+        old, new = self._robot.chosen, require_name(self._name.here.value, "a robot")
         robots = self._subscription.change_robots(RobotsRequest(rename={old: new}))
-        self._name.value = ""
+        self._robot.offer(sorted(robots.robots), NO_ROBOT)
+        self._robot.here.value, self._name.here.value = new, ""
         return self._note(robots, f"{old} is {new} now", RobotsRequest(rename={new: old}), new)
 
     def delete(self) -> str:
         """Remove the robot."""
-        name = str(self._robot.value)
-        before = self._present(name)
-        robots = self._subscription.change_robots(RobotsRequest(remove=(name,)))
-        return self._note(robots, f"{name} is deleted", RobotsRequest(define={name: before}), name)
+        return self._remove((self._robot.chosen,))
+
+    def delete_all(self) -> str:
+        """Remove the selected robots."""
+        return self._remove(self._selection.names)
 
     def move_pivot(self) -> str:
         """Move the robot's origin."""
-        name, (x, y, z) = str(self._robot.value), self._pivot.value
+        name, (x, y, z) = self._robot.chosen, self._pivot.here.value
         about = f"the origin of {name} moved by {x:g}, {y:g}, {z:g} m"
         outcome = self._reframe(name, lambda robot: move_origin(robot, (x, y, z)), about)
-        self._pivot.value = (0.0, 0.0, 0.0)
+        self._pivot.here.value = (0.0, 0.0, 0.0)
         return outcome
 
     def turn(self) -> str:
         """Turn the robot's x axis."""
-        name, degrees = str(self._robot.value), float(self._degrees.value)
+        name, degrees = self._robot.chosen, float(self._degrees.here.value)
         about = f"the x axis of {name} turned by {degrees:g} degrees"
         return self._reframe(name, lambda robot: turn_heading(robot, degrees), about)
 
     def undo(self) -> str:
-        """Revert the latest change of this page that is not undone yet, unless its robot was changed since."""
+        """Revert the latest change of this page that is not undone yet, unless its robots were changed since."""
         change = self._changes.pop()
-        if self._subscription.declared_robots().robots.get(change.name) != change.after:
+        present = self._subscription.declared_robots().robots
+        changed = [name for name, robot in change.after.items() if present.get(name) != robot]
+        if changed:
             raise FusionError(
-                f"{change.name} was changed since by another program or page; it is left as it is"
+                f"{', '.join(changed)} changed since, by another program or page: nothing is undone"
             )
         return self._describe(self._subscription.change_robots(change.undo), f"undone: {change.about}")
 
@@ -139,21 +140,37 @@ class RobotEditor:
         save_robots(robots, path)
         return f"wrote {len(robots)} robots to {path}"
 
-    def _present(self, name: str) -> Robot:
+    def _remove(self, names: tuple[str, ...]) -> str:
+        before = self._present(names)
+        robots = self._subscription.change_robots(RobotsRequest(remove=names))
+        verb = "is" if len(names) == 1 else "are"
+        return self._note(robots, f"{', '.join(names)} {verb} deleted", RobotsRequest(define=before), *names)
+
+    def _present(self, names: tuple[str, ...]) -> dict[str, Robot]:
         robots = self._subscription.declared_robots().robots
-        if name not in robots:
-            raise FusionError(f"there is no robot '{name}' any more; choose another one")
-        return robots[name]
+        if gone := [name for name in names if name not in robots]:
+            raise FusionError(f"there is no robot '{gone[0]}' any more; choose another one")
+        return {name: robots[name] for name in names}
 
     def _reframe(self, name: str, change: Callable[[Robot], Robot], about: str) -> str:
-        before = self._present(name)
+        before = self._present((name,))
         robots = self._subscription.reframe_robot(name, change)
-        return self._note(robots, about, RobotsRequest(define={name: before}, replace=True), name)
+        return self._note(robots, about, RobotsRequest(define=before, replace=True), name)
 
-    def _note(self, robots: Robots, about: str, undo: RobotsRequest, name: str) -> str:
-        self._changes.append(RobotChange(about, undo, name, robots.robots.get(name)))
+    def _note(self, robots: Robots, about: str, undo: RobotsRequest, *names: str) -> str:
+        self._changes.append(RobotChange(about, undo, {name: robots.robots.get(name) for name in names}))
         return self._describe(robots, about)
 
     def _describe(self, robots: Robots, change: str) -> str:
         unsaved = "; not saved on the server: use Save all robots" if robots.unsaved else ""
         return f"{change}{unsaved}"
+
+
+def _add_pivot(gui: viser.GuiApi) -> viser.GuiVector3Handle:
+    hint = "the new origin in the robot's present frame"
+    return gui.add_vector3("Pivot, m", (0.0, 0.0, 0.0), step=0.001, hint=hint)
+
+
+def _add_degrees(gui: viser.GuiApi) -> viser.GuiNumberHandle[float]:
+    hint = "of the x axis, counterclockwise seen from above"
+    return gui.add_number("Turn, degrees", 90.0, step=1.0, hint=hint)

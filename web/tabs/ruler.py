@@ -35,7 +35,7 @@ class Ruler:
             thickness=THICKNESS_M,
             visible=False,
         )
-        self._button.on_click(lambda _: self._toggle())
+        self._button.on_click(self.toggle)
         server.scene.on_click()(lambda click: self.select(click.ray_origin, click.ray_direction))
 
     def select(self, origin: ArrayLike, direction: ArrayLike) -> None:
@@ -62,7 +62,8 @@ class Ruler:
             if first is not None and second is not None:
                 set_content(self._answer, small(describe_distance(timed.message, first, second)))
 
-    def _toggle(self) -> None:
+    def toggle(self, _: object) -> None:
+        """Begin to measure, or end."""
         self._active, self._ends = not self._active, []
         set_property(self._button, "label", STOP if self._active else MEASURE)
         set_content(self._answer, small("click two markers in the scene" if self._active else ""))

@@ -61,7 +61,7 @@ class WandSessionPanel:
                 hint="one camera: it was moved or is new, and the other cameras stay as they are",
             )
             self._answer = Answer(server.gui)
-            self._session = LongAction(server.gui, LABELS, self._calibrate, self._answer)
+            self.session = LongAction(server.gui, LABELS, self._calibrate, self._answer)
             self.decision = Decision(server.gui, "the calibration", self._use, self._forget, self._answer)
             self._cameras = server.gui.add_html("")
         self._preview = CameraDrawing(server.scene, "/candidate", PREVIEW)
@@ -70,9 +70,9 @@ class WandSessionPanel:
 
     def next_action(self) -> str:
         """What the operator should do in the session, or with its result; empty if there is none."""
-        if self._session.is_running and self._session.handle.disabled:
+        if self.session.is_running and self.session.handle.disabled:
             return "the wand session has ended: wait for its calibration"
-        if self._session.is_running:
+        if self.session.is_running:
             return "a wand session runs: wave where the table in Calibrate says"
         is_ready = self.decision.result is not None
         return "a new calibration is ready: decide in Calibrate whether to use it" if is_ready else ""
@@ -82,11 +82,11 @@ class WandSessionPanel:
         step = next_step(state)
         known = state.rig.cameras if state.rig is not None and state.rig.placed() else {}
         names = (ALL, *sorted(known.keys() & state.cameras.keys()))
-        if names != tuple(self._which.options) and not self._session.is_running:
+        if names != tuple(self._which.options) and not self.session.is_running:
             self._which.options = names
         is_next = step == "calibrate" and self.decision.result is None
-        self._session.show(enabled=step != "cameras", primary=is_next)
-        self.decision.show(enabled=not self._session.is_running)
+        self.session.show(enabled=step != "cameras", primary=is_next)
+        self.decision.show(enabled=not self.session.is_running)
 
     def _use(self, candidate: Rig) -> str:
         """Write the calibrated rig and have the server use it; raises as `apply_rig`."""
@@ -101,7 +101,7 @@ class WandSessionPanel:
 
     def close(self) -> None:
         """End the session and save its recording, without calibrating."""
-        self._session.close(CLOSE_S)
+        self.session.close(CLOSE_S)
 
     def _calibrate(self, end: threading.Event) -> str:
         self.decision.clear()
@@ -123,10 +123,10 @@ class WandSessionPanel:
             settings = WandSession(rig=before, wand=wand, trials=False, stops_itself=False)
         show = partial(self._show, settings, "" if only == ALL else ONLY_ADVICE.format(only))
         collected, reason = run_wand_session(session, arena, settings, show, end)
-        self._session.handle.disabled = True
+        self.session.handle.disabled = True
         recording = wand_recording_path(files.rig)
         save_wand_recording(recording, arena, collected.messages)
-        if self._session.is_closed:
+        if self.session.is_closed:
             return ""
         self._answer.show(f"wand session ended: {reason}; calibrating")
         if only == ALL:

@@ -15,6 +15,7 @@ from camera_node.foundation.config import example_file, load_yaml
 from camera_node.geometry.body import Body
 from web.condition import next_step
 from web.errors import WebError
+from web.own_control import OwnControl
 from web.scene.surroundings import WorldPreview
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
@@ -41,16 +42,10 @@ class WorldPanel:
         self._subscription, self._files, self._collect_s = subscription, files, collect_s
         self._before: Rig | None = None  # in which the new world was measured
         gui = server.gui
-        with gui.add_folder("Floor and origin", expand_by_default=False):
-            self._by = gui.add_dropdown("By", (STANDING, L_FRAME))
-            self._foot = gui.add_number(
-                "Lowest roundel, m",
-                0.0,
-                min=-1.0,
-                max=5.0,
-                step=0.001,
-                hint="of the standing wand: height of its centre above the floor",
-            )
+        place = gui.add_folder("Floor and origin", expand_by_default=False)
+        with place:
+            self._by = OwnControl(server, place, lambda gui: gui.add_dropdown("By", (STANDING, L_FRAME)))
+            self._foot = OwnControl(server, place, _add_foot)
             self._answer = answer = Answer(gui)
             self._measure = ActionButton(gui, "Measure", self.measure, answer, MEASURE_HINT)
             self.decision = Decision(gui, "the new world", self._use, self._forget, answer)
@@ -77,14 +72,14 @@ class WorldPanel:
         rig = current_rig(self._subscription, self._files)
         rig.require_placed(self._files.rig)
         body = load_yaml(self._body_file(), Body)
-        standing = self._by.value == STANDING
+        standing = self._by.here.value == STANDING
         if standing and not (len(body.markers) > 1 and is_collinear(body.points)):
             raise WebError(
                 f"{self._files.wand} is not a straight wand with two or more roundels: use an L-frame"
             )
         session, arena = self._subscription.session, self._subscription.feed.keys.arena
         collected, _ = collect_frames(session, arena, self._collect_s, lambda *_: "")
-        foot_m = float(self._foot.value) if standing else None
+        foot_m = float(self._foot.here.value) if standing else None
         change = align_to_roundels(
             rig, name_markers(body), collected.messages, foot_m, WAND if standing else FRAME
         )
@@ -110,7 +105,12 @@ class WorldPanel:
         return ""
 
     def _body_file(self) -> Path:
-        if self._by.value == STANDING:
+        if self._by.here.value == STANDING:
             return self._files.wand
         own = self._files.wand.with_name(L_FILE)
         return own if own.exists() else example_file(L_FILE)
+
+
+def _add_foot(gui: viser.GuiApi) -> viser.GuiNumberHandle[float]:
+    hint = "of the standing wand: height of its centre above the floor"
+    return gui.add_number("Lowest roundel, m", 0.0, min=-1.0, max=5.0, step=0.001, hint=hint)
