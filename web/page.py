@@ -6,13 +6,13 @@ import contextlib
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import viser
 
 from web.condition import assess
-from web.html_tables import STYLE, status_line
+from web.html_tables import STYLE, Column, HtmlTable, TableRow, small, status_line
 from web.scene.coverage_volume import CoverageVolume
-from web.shortcuts import Shortcuts
 from web.state.feed import ArenaState, Feed
 from web.state.recording_player import RecordingPlayer
 from web.state.subscription import Subscription
@@ -33,7 +33,43 @@ from web.widgets import GREY, StateText, escape_markdown, set_content, set_prope
 
 TABS = ("Cameras", "Calibrate", "Robots", "Record", "Status")  # in the order of the work
 PANEL_PX = 440
+HELP = "?"
+KEY_COLUMNS = (Column("key"), Column("action"))
 PROGRESS_S = 5.0  # the demo's progress disappears after so long without a message
+
+
+class Shortcuts:
+    """The keys of a page; `?` shows them in the browser that asks. They do nothing while a text is typed."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._gui = gui
+        self._rows: list[TableRow] = []
+        # Viser's list of keys has letters only; it passes any other one to the browser, where ? comes with Shift.
+        self.add(HELP, "Show the keys", self._show, modifier="shift")
+        gui.add_html(small(f"{HELP} shows the keys, Ctrl+K searches for an action"))
+
+    def add(
+        self,
+        key: Any,
+        label: str,
+        act: Callable[[viser.ClientHandle | None], object],
+        modifier: Any = None,
+    ) -> None:
+        """Have a key call `act` with the browser in which it was pressed."""
+        self._rows.append(TableRow((key, label), "ok"))
+        command = self._gui.add_command(label, hotkey=key, modifier=modifier)
+
+        @command.on_trigger
+        def _(event: viser.CommandEvent) -> None:
+            act(event.client)
+
+    def _show(self, client: viser.ClientHandle | None) -> None:
+        if client is None:
+            return
+        modal = client.gui.add_modal("Keys")
+        with modal:
+            client.gui.add_html(HtmlTable(KEY_COLUMNS, self._rows).html())
+            client.gui.add_button("Close").on_click(lambda _: modal.close())
 
 
 class Header:

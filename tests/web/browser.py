@@ -13,7 +13,6 @@ import pytest
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
 from tests.conftest import free_port
-from tests.waiting import DEADLINE_S
 from web.page_access import PageAccess
 from web.state.feed import Feed
 from web.view import PanelSection, View

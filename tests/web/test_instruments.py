@@ -14,8 +14,7 @@ from fusion.protocol.pose_messages import CameraHealth, Markers, RobotPose
 from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import browsing, value_of
-from web.page import add_instruments
-from web.shortcuts import Shortcuts
+from web.page import Shortcuts, add_instruments
 from web.tabs.graph_panel import CAMERA_HEALTH, LENGTH_S, ROBOT, Quantity, graph, label_lines
 from web.tabs.robot_selection import RobotSelection
 from web.tabs.ruler import Ruler, describe_distance
