@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from calib.rig.camera import Camera, transform
+from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from calib.wand.quality.agreement import CameraPoses, compare_calibrations
 from calib.wand.wand_report import WandCalibration
@@ -48,24 +48,30 @@ class Arena:
         T[:3, 3] = [0.9 * np.sin(0.7 * w), 0.9 * np.cos(0.53 * w), 1.0 + 0.5 * np.sin(0.43 * w + 1)]
         return T
 
-    def see(self, name: str, t_ns: int, sized: bool = True) -> tuple[Array, Array, Array, Mask]:
-        """Project the markers into a camera; both sides of the wand are visible.
+    def see(self, name: str, times_ns: list[int], sized: bool = True) -> tuple[Array, Array, Array, Mask]:
+        """Project the markers into a camera at n times; both sides of the wand are visible.
 
         Returns:
-            uv: (M, 2) centres of the ellipses if `sized`, else of the discs.
-            axes, angle: (M, 2) full axes and (M,) angles of the ellipses.
-            visible: (M,) whether the marker is inside of the image and large enough.
+            uv: (n, M, 2) centres of the ellipses if `sized`, else of the discs.
+            axes, angle: (n, M, 2) full axes and (n, M) angles of the ellipses.
+            visible: (n, M) whether the marker is inside of the image and large enough.
         """
-        camera = self.truth.cameras[name]
-        T = invert(camera.matrix()) @ self.wand_pose(t_ns * 1e-9)
-        points = transform(T, self.wand.points)
-        normals = np.repeat(T[None, :3, 2], len(points), axis=0)
+        camera, count = self.truth.cameras[name], len(self.wand.points)
+        T = invert(camera.matrix()) @ np.array([self.wand_pose(t_ns * 1e-9) for t_ns in times_ns])
+        points = (self.wand.points @ T[:, :3, :3].mT + T[:, None, :3, 3]).reshape(-1, 3)
+        normals = np.repeat(T[:, :3, 2], count, axis=0)
         side = -np.sign(np.einsum("ni,ni->n", normals, points))
         points = points + thickness_of(self.wand) / 2 * side[:, None] * normals
         uv, axes, angles = outlines(camera, points, normals, self.wand.diameter_m / 2)
         uv = uv if sized else camera.project(points)
         inside = ((uv > 15) & (uv < [camera.width - 15, camera.height - 15])).all(axis=1)
-        return uv, axes, angles, inside & (axes[:, 1] > 5)
+        shape = (len(times_ns), count)
+        return (
+            uv.reshape(*shape, 2),
+            axes.reshape(*shape, 2),
+            angles.reshape(shape),
+            (inside & (axes[:, 1] > 5)).reshape(shape),
+        )
 
 
 def outlines(camera: Lens, points: Array, normals: Array, radius: float) -> tuple[Array, Array, Array]:
@@ -151,18 +157,18 @@ def record(arena: Arena, seconds: float = 10.0, **options: Any) -> list[Detectio
     for k, (name, camera) in enumerate(arena.truth.cameras.items()):
         phase = k * period_ns // (3 * len(arena.truth.cameras)) if chosen.free_running else 0
         header = {"camera": name, "width": camera.width, "height": camera.height}
-        for seq in range(int(seconds * 1e9 / period_ns)):
-            t_ns = seq * period_ns + phase
-            roundels = _detect(arena, name, t_ns, chosen, rng)
-            messages.append(Detections.pack(roundels, seq=seq, t_ns=t_ns, **header))
+        times = [seq * period_ns + phase for seq in range(int(seconds * 1e9 / period_ns))]
+        for seq, seen in enumerate(zip(*arena.see(name, times, chosen.sized), strict=True)):
+            roundels = _detect(*seen, chosen, rng)
+            messages.append(Detections.pack(roundels, seq=seq, t_ns=times[seq], **header))
     return messages
 
 
 def _detect(
-    arena: Arena, name: str, t_ns: int, options: DetectorOptions, rng: np.random.Generator
+    uv: Array, axes: Array, angles: Array, seen: Mask, options: DetectorOptions, rng: np.random.Generator
 ) -> Roundels:
-    uv, axes, angles, seen = arena.see(name, t_ns, options.sized)
-    seen &= rng.random(len(uv)) >= options.missing
+    """The detections in one frame of markers (M,), as `see` returns them."""
+    seen = seen & (rng.random(len(uv)) >= options.missing)
     rows = rng.permutation(np.flatnonzero(seen))
     uv = uv[rows] + options.sigma_px * rng.standard_normal((len(rows), 2))
     gross = rng.random(len(rows)) < options.outliers
