@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A synthetic arena: detections by free-running cameras of robots with known motion."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import msgspec
@@ -120,11 +121,15 @@ class Arena:
             for name, phase in zip(self.cameras, self.phases, strict=False)
             for k in range(n)
         )
+        ideal = {
+            name: self._ideal(name, [(t_ns - START_NS) * 1e-9 for t_ns, seen_by in times if seen_by == name])
+            for name in self.cameras
+        }
         return [
             CalibratedFrame.measure(
                 name,
                 t_ns,
-                self.detect(name, (t_ns - START_NS) * 1e-9, rng),
+                self._disturb(next(ideal[name]), rng),
                 self.cameras[name],
                 readout_s=self.readout_s,
             )
@@ -157,34 +162,60 @@ class Arena:
 
     def detect(self, name: str, t: float, rng: np.random.Generator) -> Roundels:
         """What a camera detects in a frame whose middle is read at t seconds."""
+        return self._disturb(next(self._ideal(name, [t])), rng)
+
+    def _ideal(self, name: str, times: list[float]) -> Iterator[tuple[np.ndarray, ...]]:
+        """The outlines of the discs in each of a camera's frames, without noise.
+
+        The centres come from sampled circles, independently of the model under test.
+
+        Yields:
+            For each frame the columns uv and axes (N, 2), angles (N,), rows of the marker table, codes, and the
+            rotations of codes.
+        """
         camera = self.cameras[name]
-        marker_table = MarkerTable.of(list(self.robots.values()))
+        table = MarkerTable.of(list(self.robots.values()))
         robots = list(self.robots)
-        owners = zip(marker_table.robot, marker_table.number, strict=True)
-        hidden = [self.hidden(robots[r], int(m), t) for r, m in owners]
-        seen = np.flatnonzero(~np.array(hidden, bool)).astype(np.int32)
-        t_s = np.full(len(seen), t)
+        owners = [(robots[r], int(m)) for r, m in zip(table.robot, table.number, strict=True)]
+        hidden = [[self.hidden(robot, m, t) for robot, m in owners] for t in times]
+        frame, row = np.nonzero(~np.array(hidden, bool).reshape(len(times), len(owners)))
+        middle = np.array(times, float)[frame]
+        t_s = middle
         for _ in range(ROW_STEPS if self.readout_s else 0):
-            uv = camera.project_world(self._place(marker_table, seen, t_s)[0])
-            t_s = t + self.readout_s * np.nan_to_num(camera.image_row(uv)).clip(-0.5, 0.5)
-        (centre, normal, zero), (later, *_) = (
-            self._place(marker_table, seen, t_s + dt) for dt in (0.0, STEP_S)
-        )
+            uv = camera.project_world(self._place(table, row, t_s)[0])
+            t_s = middle + self.readout_s * np.nan_to_num(camera.image_row(uv)).clip(-0.5, 0.5)
+        (centre, normal, zero), (later, *_) = (self._place(table, row, t_s + dt) for dt in (0.0, STEP_S))
         speed = (camera.project_world(later) - camera.project_world(centre)) / STEP_S
-        shear = speed * self.readout_s / camera.height
-        code = marker_table.code[seen]
-        return self._roundels(
-            camera, (seen, centre, normal, marker_table.radius[seen], shear, zero, code), rng
+        to = camera.matrix()[:3, 3] - centre
+        facing = np.einsum("ni,ni->n", normal, to) > self.min_facing * np.linalg.norm(to, axis=1)
+        radius, code, uv = table.radius[row], table.code[row], np.full((len(centre), 2), np.nan)
+        uv[facing] = outline_centres(camera, centre[facing], normal[facing], radius[facing])
+        inside = ((uv > 15) & (uv < [785, 585])).all(1)
+        uv, frame, row, centre, normal, zero, speed, radius, code = (
+            column[inside] for column in (uv, frame, row, centre, normal, zero, speed, radius, code)
         )
+        shear = speed * self.readout_s / camera.height
+        S = np.linalg.inv(np.eye(2) - shear[:, :, None] * [0.0, 1.0])
+        shape = S @ self._outlines(camera, centre, normal, radius) @ S.transpose(0, 2, 1)
+        values, vectors = np.linalg.eigh(shape)
+        rim = camera.project_world(centre + radius[:, None] * zero).reshape(-1, 2) - uv
+        q = np.einsum("nji,nj->ni", vectors, rim) / np.sqrt(values)
+        q = np.einsum("nij,nj->ni", vectors, q)
+        angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+        turn = np.arctan2(q[:, 1], q[:, 0])
+        columns = (uv, 2 * np.sqrt(values[:, ::-1]), angle, row, code, turn)
+        starts = np.searchsorted(frame, np.arange(1, len(times)))
+        return zip(*(np.split(column, starts) for column in columns), strict=True)
 
     def _place(
         self, markers: MarkerTable, rows: np.ndarray, t_s: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centres, normals and directions to the zeros of codes (N, 3) of markers, each at its own time (N,)."""
         robots = list(self.robots)
-        poses = [self.motions[robots[markers.robot[k]]](t) for k, t in zip(rows, t_s, strict=True)]
-        R = np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)
-        p = np.array([pose[1] for pose in poses]).reshape(-1, 3)
+        pose = functools.cache(lambda robot, t: self.motions[robots[robot]](t))
+        poses = [pose(r, t) for r, t in zip(markers.robot[rows].tolist(), t_s.tolist(), strict=True)]
+        R = np.array([R for R, _ in poses]).reshape(-1, 3, 3)
+        p = np.array([p for _, p in poses]).reshape(-1, 3)
         centre = p + np.einsum("nij,jn->ni", R, markers.position[:, rows])
         axes = np.concatenate([robot.code_axes for robot in self.robots.values()])[rows]
         turn = self.card_turn_rad * markers.number[rows][:, None]
@@ -193,35 +224,10 @@ class Arena:
         normal, zero = (np.einsum("nij,nj->ni", R, v) for v in (normals, axes))
         return centre, normal, zero
 
-    def _roundels(self, camera: Camera, discs: tuple[np.ndarray, ...], rng: np.random.Generator) -> Roundels:
-        """Outlines of discs; `id` is the code, or else the row of the marker table, -1 for distractors.
-
-        The centres come from sampled circles, independently of the model under test.
-
-        Args:
-            camera: that sees them.
-            discs: rows of the marker table (N,), centres and normals (N, 3), radii (N,), and the motion of the image
-                from one row to the next (N, 2), pixels; directions of codes (N, 3) and codes (N,).
-            rng: of noise, distractors and order.
-        """
-        to = camera.matrix()[:3, 3] - discs[1]
-        facing = np.einsum("ni,ni->n", discs[2], to) > self.min_facing * np.linalg.norm(to, axis=1)
-        discs = tuple(column[facing] for column in discs)
-        uv = np.array([outline_centre(camera, *disc) for disc in zip(*discs[1:4], strict=True)])
-        uv = uv.reshape(-1, 2)
-        inside = ((uv > 15) & (uv < [785, 585])).all(1)
-        uv, (number, centre, normal, radius, shear, zero, code) = (
-            uv[inside],
-            (column[inside] for column in discs),
-        )
-        S = np.linalg.inv(np.eye(2) - shear[:, :, None] * [0.0, 1.0])
-        shape = S @ self._outlines(camera, centre, normal, radius) @ S.transpose(0, 2, 1)
-        values, vectors = np.linalg.eigh(shape) if len(uv) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
-        rim = camera.project_world(centre + radius[:, None] * zero).reshape(-1, 2) - uv
-        q = np.einsum("nji,nj->ni", vectors, rim) / np.sqrt(values)
-        q = np.einsum("nij,nj->ni", vectors, q)
-        axes = 2 * np.sqrt(values[:, ::-1])
-        angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    def _disturb(self, ideal: tuple[np.ndarray, ...], rng: np.random.Generator) -> Roundels:
+        """The discs of one frame with noise and distractors, in any order; `id` is the code, or else the row of the
+        marker table, -1 for distractors."""
+        uv, axes, angle, row, code, turn = ideal
         extra = self.distractors
         uv = np.vstack([uv, rng.uniform([20, 20], [780, 580], (extra, 2))])
         axes = np.vstack([axes, np.sort(rng.uniform(10, 30, (extra, 2)))[:, ::-1]])
@@ -232,10 +238,10 @@ class Arena:
         cov = np.tile(max(self.sigma_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1))
         level, none = np.full(n, 0.6), np.full(n, -1, np.int32)
         unread = np.full(extra, np.nan)
-        number = np.concatenate([np.where(code > 0, code, number), np.full(extra, -1)]).astype(np.int32)
+        number = np.concatenate([np.where(code > 0, code, row), np.full(extra, -1)]).astype(np.int32)
         sure, turn, sigma = (
             np.concatenate([np.where(code > 0, value, np.nan), unread])
-            for value in (1.0, np.arctan2(q[:, 1], q[:, 0]), ROTATION_SIGMA)
+            for value in (1.0, turn, ROTATION_SIGMA)
         )
         turn = turn + ROTATION_SIGMA * np.sign(self.sigma_px) * np.cos(1e6 * uv[:, 0])
         columns = (uv, cov, axes, angle, level, 200 * level, number, none, sure, turn, sigma)
@@ -249,10 +255,12 @@ class Arena:
         return outlines(c, n, radius, scale)
 
 
-def outline_centre(camera: Camera, centre: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:
-    """The centre of the ellipse through the image of a disc's rim, as a detector fits it, raw pixels."""
-    u = np.linalg.svd(normal[None])[2][1:]
+def outline_centres(camera: Camera, centre: np.ndarray, normal: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """The centres (N, 2) of the ellipses through the images of discs' rims, as a detector fits them, raw pixels."""
+    u = np.linalg.svd(normal[:, None])[2][:, 1:]
     phi = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    rim = centre + radius * (np.cos(phi)[:, None] * u[0] + np.sin(phi)[:, None] * u[1])
-    uv = camera.project_world(rim)
-    return fit_ellipses(uv[None])[0][0] if np.isfinite(uv).all() else np.full(2, np.nan)
+    rim = centre[:, None] + radius[:, None, None] * (np.column_stack([np.cos(phi), np.sin(phi)]) @ u)
+    uv = camera.project_world(rim.reshape(-1, 3)).reshape(-1, 16, 2)
+    seen, found = np.isfinite(uv).all(axis=(1, 2)), np.full((len(uv), 2), np.nan)
+    found[seen] = fit_ellipses(uv[seen])[0]
+    return found
