@@ -14,8 +14,8 @@ from camera_node.foundation.arrays import Array, Grey
 class Reason(IntEnum):
     """The test that a ring fails; the numbers are those of `Refusal` in native/verify/acceptance.hpp."""
 
-    NO_FIT, RATIO, CONTRAST, LEVELS, SIZE, CARD = range(6)
-    RESIDUALS, EDGES, INSIDE, COVER, BULLSEYE, PALE_INK = range(6, 12)
+    NO_FIT, RATIO, CONTRAST, SIZE, CARD, RESIDUALS = range(6)
+    EDGES, INSIDE, COVER, BULLSEYE, PALE_INK = range(6, 11)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,6 @@ def _ring(row: Array, settings: DetectorSettings, prints: tuple[float, ...]) -> 
         Reason.NO_FIT: "no roundel fits it: mostly not a ring",
         Reason.RATIO: f"ratio {ratio:.2f}; the prints have {wanted}",
         Reason.CONTRAST: f"contrast {contrast:.0f}; {settings.min_contrast:g} grey levels are needed",
-        Reason.LEVELS: "levels out of the camera's range: clipped",
         Reason.SIZE: f"{major:.1f} px; {sizes} are allowed",
         Reason.CARD: "no white around the ring",
         Reason.RESIDUALS: f"edges differ from the model by {100 * misfit:.0f} % of the contrast",

@@ -13,7 +13,6 @@ namespace roundel {
 namespace {
 
 constexpr size_t kMaxRoundels = 4096;  // limit of a message
-constexpr size_t kMinWitnesses = 3;    // roundels that show a camera, of which one may be none
 constexpr int kMaxFits = 512;          // of seeds in a frame
 constexpr size_t kMaxLost = 8;         // lost roundels of a frame that are searched with motion blur
 constexpr int kMaxMovingFits = 32;     // of streaks in a frame,

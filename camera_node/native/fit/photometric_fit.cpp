@@ -29,7 +29,6 @@ constexpr double kConverged = 1;            // remaining distance in standard de
 constexpr double kVisible = 2.5;            // times the noise: the slope of an edge is 0.4 contrast / blur
 constexpr int kResumedPixels = 128;         // of the first iterations from the last frame's model,
 constexpr int kMinSampling = 3;             // used if there are so many times as many pixels
-constexpr int kMaxResumedSteps = 3;         // from the last frame's model
 constexpr double kMaxResumedMisfit = 0.25;  // residuals over the contrast: edges are off by half a blur
 constexpr int kEdgeUnknowns = kCount - 3;   // all but the grey levels
 
@@ -69,15 +68,13 @@ constexpr double kLeastTilt = 0.05;
 // Residuals from which a fit is no roundel on bent paper, over the contrast. A bend of 2 % leaves 0.14 at 160
 // px and residuals grow with bend and size, until edges are a blur away: 0.35 for one of 5 % there.
 constexpr double kBentResidual = 0.35 / 160;  // for each pixel of the diameter,
-constexpr double kLeastBentResidual = 0.2;    // at least this
-constexpr double kMostBentResidual = 0.7;     // and at most
+constexpr double kLeastBentResidual = 0.2;    // and at least this
 // Standard deviation of the level around a card in uneven light, over the contrast: no function of light is
 // as good there as on the print.
 constexpr double kUnevenGround = 0.04;
 
 // 3. Levels far from the edges
 constexpr double kMinPlateauMajor = 48;  // pixels: smaller ones gain less than a tone curve costs
-constexpr int kMinPlateau = 16;          // pixels
 constexpr double kPlateauVariance = 2;   // factor from that of the residuals at the edges
 constexpr double kMaxPlateauError = 3;   // standard deviations
 
@@ -289,7 +286,7 @@ bool PhotometricFitter::iterate(const EdgePixels& pixels, int steps_to_go) {
         linearize(pixels);
         const double seen = edge_scale();
         if (resumed_ && coarse && seen < kSlackScale * scale_) return true;
-        if (resumed_ && (k == kMaxResumedSteps || seen > kMaxResumedMisfit * contrast())) return false;
+        if (resumed_ && seen > kMaxResumedMisfit * contrast()) return false;
         const double used = coarse ? std::min(scale_, kStrictScale * seen)
                                    : std::clamp(scale_, kStrictScale * seen, kSlackScale * seen);
         if (!solve(used)) return false;
@@ -382,8 +379,7 @@ bool PhotometricFitter::shows_bend() {
     for (int i = 0; i < kCount; ++i) step[i] -= linearized_at_[i];
     fields_.scores = score_fields(equations_, pixels_, FieldFrame(p_), step, {scale_, spread_});
     for (double* score : {&fields_.scores.bend, &fields_.scores.light}) *score /= square(noise_);
-    const double most =
-        std::clamp(kBentResidual * (p_[kAxx] + p_[kAyy]), kLeastBentResidual, kMostBentResidual);
+    const double most = std::max(kLeastBentResidual, kBentResidual * (p_[kAxx] + p_[kAyy]));
     return allowed_ == AllowedFields::kBend && fields_.scores.bend > kUnlikelyField &&
            scale_ < most * contrast();
 }
@@ -475,7 +471,7 @@ bool PhotometricFitter::step_with_fields(const Vector<kFields>& prior, double& m
 /// the edges: where cameras sharpen, in uneven light, or for writing on the paper. Its noise must be that of
 /// the edges, too, which a tone curve and compression change.
 bool PhotometricFitter::condition_on_plateau(Parameter level, const Plateau& plateau, Parameters& g) {
-    if (plateau.count < kMinPlateau || plateau.variance > kPlateauVariance * square(noise_) ||
+    if (plateau.count == 0 || plateau.variance > kPlateauVariance * square(noise_) ||
         plateau.variance < square(noise_) / kPlateauVariance)
         return false;
     if (plateau.mean < 2 * noise_ || plateau.mean > double(kClippedPlateau))

@@ -12,20 +12,15 @@ namespace roundel {
 
 namespace {
 
-constexpr double kTiny = 11;               // pixels: blur and ratio of smaller ones are correlated, so the
-constexpr double kMaxRatioSigma = 0.04;    // tolerance grows by two standard deviations of at most this size
-constexpr double kUnderflow = 30;          // grey levels that a blurred ring's levels may be out of range,
-constexpr double kOverflow = 500;          // and those of clipped paper
 constexpr double kMisfit = 0.045;          // of the contrast: RMS residual on the ring's edges
 constexpr double kRaggedMisfit = 0.062;    // the same for smoothed edges
+constexpr double kMinRagged = 16;          // pixels: smaller ragged rings may be letters
 constexpr double kMaxGrowth = 2.5;         // factor of the misfit allowed for the largest roundels, and
 constexpr double kMaxRaggedGrowth = 1.5;   // for smoothed ones
 constexpr double kMaxOffset = 0.15;        // pixels: RMS displacement of an edge around its ellipse
 constexpr double kMaxOffsetRadius = 0.04;  // the same for the smallest, over the radius
 constexpr double kChance = 2;              // times the displacement that noise alone makes
 constexpr double kHardBlur = 0.35;         // pixels: sharper edges were drawn to whole pixels
-constexpr double kRaggedSupport = 0.8;     // share of the edges that agree with the model
-constexpr double kMinRagged = 16;          // pixels: smaller ragged rings may be letters
 constexpr double kSameLevel = 0.2;         // of the contrast: the ground is as bright as the card
 constexpr double kMinCard = 1.1;           // outer diameters: least diameter of a card whose edge shows
 constexpr double kProcessing = 0.5;        // share of a misfit that may be common to a whole edge
@@ -35,9 +30,8 @@ constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped
 // differ from those of a thinner and darker ring: its ink must be black.
 constexpr double kThinRing = 3.6;
 constexpr double kBlackInk = 0.7;  // share of the paper's level below which ink is black
-// Sectors of 32 with residuals of so much contrast, from which a part of a refused ring counts as covered.
+// Residuals of a sector, over the contrast, from which a part of a refused ring counts as covered.
 constexpr double kHidden = 0.3;
-constexpr int kMinHidden = 3;
 constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of uneven light may leave
 constexpr double kLarge = 160;         // pixels: bends of 5 % are fitted up to this size
 constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
@@ -99,8 +93,7 @@ bool passes(const ImageView& image, const RoundelFit& fit, const AcceptanceConte
 
 /// Whether ragged edges may be the reason that a fit was rejected.
 bool may_be_ragged(const RoundelFit& fit, const RoundelLimits& limits) {
-    return has_known_ratio(fit, limits) && limits.contrast(fit.dark, fit.bright) >= limits.min_contrast / 2 &&
-           fit.support >= kRaggedSupport;
+    return has_known_ratio(fit, limits) && limits.contrast(fit.dark, fit.bright) >= limits.min_contrast / 2;
 }
 
 std::optional<RoundelFit> fit_ragged(const ImageView& image, const InitialGuess& guess,
@@ -190,16 +183,13 @@ std::optional<TestedFit> fit_uneven(const ImageView& image, InitialGuess guess, 
 }  // namespace
 
 bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits) {
-    const double chance = fit.outer.major < kTiny ? 2 * std::min(fit.ratio_sigma, kMaxRatioSigma) : 0;
-    return limits.print_error(fit.ratio) <= std::hypot(limits.ratio_tolerance, chance);
+    return limits.print_error(fit.ratio) <= limits.ratio_tolerance;
 }
 
 std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits) {
     if (!has_known_ratio(fit, limits) && !limits.may_be_print(fit.ratio, fit.outer.major))
         return Refusal::kRatio;
     if (limits.contrast(fit.dark, fit.bright) < limits.min_contrast) return Refusal::kContrast;
-    const double brightest = 255 + (fit.clipped ? kOverflow : kUnderflow);
-    if (fit.dark <= -kUnderflow || fit.bright >= brightest) return Refusal::kLevels;
     const double major = fit.outer.major;
     if (major < limits.min_diameter || major > limits.max_diameter) return Refusal::kSize;
     return std::nullopt;
@@ -217,7 +207,7 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
                                     const AcceptanceContext& context) {
     const EdgeMisfit misfit(image, fit.p, fit.fields);
     const OcclusionMask hidden = misfit.occlusion(context.noise, kHidden * fit.contrast());
-    const bool covered = count_sectors(hidden.outer | hidden.inner) >= kMinHidden;
+    const bool covered = hidden.any();
     const auto failure = first_failure(image, fit, context, {kMisfit, kMaxGrowth});
     // A cover biases ratio, card, residuals and levels, but neither contrast nor size.
     if (failure == Refusal::kContrast || failure == Refusal::kSize || (failure && !covered)) return failure;

@@ -9,8 +9,7 @@
 
 namespace roundel {
 
-/// Whether the ratio is that of a known print, within the tolerance and the uncertainty of the smallest
-/// roundels.
+/// Whether the ratio is that of a known print, within the tolerance.
 bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits);
 
 /// Whether the ink is black if the ring is so thin that the picture does not tell a pale ring from a thinner
@@ -22,7 +21,6 @@ enum class Refusal {
     kNoFit,      // the model of a roundel does not converge on it
     kRatio,      // not a print's
     kContrast,   // too low
-    kLevels,     // ink or paper beyond what the camera can show
     kSize,       // out of limits
     kCard,       // no white around the ring
     kResiduals,  // too large at the edges
@@ -36,7 +34,7 @@ enum class Refusal {
 /// The limit that a fit exceeds, if any.
 std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits);
 
-/// Whether contrast, ratio and size are within their limits, and the grey levels within a camera's range.
+/// Whether contrast, ratio and size are within their limits.
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits);
 
 /// What the acceptance tests of a frame depend on, beside the fit.

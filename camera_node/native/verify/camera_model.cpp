@@ -8,8 +8,6 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMinDiameter = 12;      // pixels: ratio and blur of smaller roundels are correlated
-constexpr double kDarkest = 2;           // of the levels that are certainly not clipped
 constexpr double kBrightest = 250;       // of the levels that are certainly not clipped
 constexpr double kMaxLogExponent = 0.9;  // 2.5: steeper ones enlarge what compression leaves
 constexpr int kHalvings = 16;            // of the interval of exponents
@@ -23,17 +21,12 @@ constexpr double kMinLeft = 0.15;    // of a curvature: less is the error of the
 constexpr double kMinChange = 0.02;  // of the logarithm
 constexpr double kMaxSigma = 0.15;   // of the logarithm, from which it is used
 constexpr size_t kMaxMeasured = 8;   // roundels of a frame
-constexpr unsigned kFirstFits = 16;  // frames after which the tone curve is fitted in one of
-constexpr unsigned kFitInterval = 8;     // so many
 constexpr double kMedianSquare = 0.455;  // of a normal variable of variance 1
-constexpr double kMemory = 0.2;          // weight of a new frame
-constexpr size_t kMinWitnesses = 3;  // roundels that show a change of the camera, of which one may be wrong
-constexpr double kChanged = 9;  // median of squared changes over their variance: three standard deviations
 
 /// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
 /// mean of both; levels of 255.
 double log_exponent_of(double dark, double bright, double middle) {
-    const double d = std::log(std::max(dark, kDarkest) / 255), b = std::log(bright / 255),
+    const double d = std::log(std::max(dark, 1.0) / 255), b = std::log(bright / 255),
                  m = std::log((dark + middle * (bright - dark)) / 255);
     double low = -kMaxLogExponent, high = kMaxLogExponent;
     for (int k = 0; k < kHalvings; ++k) {
@@ -42,14 +35,6 @@ double log_exponent_of(double dark, double bright, double middle) {
         (too_bright ? low : high) = log_g;
     }
     return (low + high) / 2;
-}
-
-template <typename T, typename Key>
-T& median_by(std::vector<T>& values, const Key& key) {
-    const auto middle = values.begin() + ptrdiff_t(values.size() / 2);
-    std::nth_element(values.begin(), middle, values.end(),
-                     [&](const T& a, const T& b) { return key(a) < key(b); });
-    return *middle;
 }
 
 }  // namespace
@@ -107,7 +92,7 @@ void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
     const double exponent = exponent_in_use();
     const bool changed = learn_tone(std::move(measured));
     is_new_ = false;
-    learn_remainder(changed);
+    learn_remainder();
     if (!changed) return;
     last_.clear();
     light_.scale(exponent_in_use() / exponent);
@@ -117,7 +102,7 @@ void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
 /// What the difference between the measured ratio and the print's says about the tone curve. A curve that
 /// brightens the levels between ink and paper by `curvature` s (1 - s) moves both edges into the ring.
 std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFit& fit) const {
-    if (fit.outer.major < kMinDiameter || fit.dark < kDarkest || fit.bright > kBrightest) return std::nullopt;
+    if (!is_measured(fit) || fit.bright > kBrightest) return std::nullopt;
     const Print& print = nearest_print(prints_, fit.ratio);
     const double by_curvature = ratio_by_curvature(fit, print.ratio);
     const double left = (fit.ratio - print.ratio) / by_curvature, curvature = left + fit.curvature;
@@ -135,12 +120,10 @@ std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFi
 }
 
 /// What the tone curve leaves beside the power, if the power does not describe it.
-void CameraModel::learn_remainder(bool linearization_changed) {
-    if (n_learned_++ % kFitInterval && n_learned_ > kFirstFits && !linearization_changed) return;
+void CameraModel::learn_remainder() {
     tone_.fit();
     const double exponent = std::exp(log_exponent_);
-    const bool differs = tone_.has_shoulder() || std::abs(std::log(tone_.exponent() / exponent)) > kMinTone;
-    const bool is_power = !differs || tone_.left_by(exponent) < kMinLeft;
+    const bool is_power = tone_.left_by(exponent) < kMinLeft;
     if (is_power == remainder_.any() || sigma_ == 0) knows_curvature_ = false;
     if (is_power) {
         remainder_ = {};
@@ -154,15 +137,14 @@ void CameraModel::learn_remainder(bool linearization_changed) {
 
 void CameraModel::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
     if (fits.empty()) return;
-    const auto median_of = [&](double RoundelFit::* of) {
+    const auto median = [&](double RoundelFit::* of) {
         std::vector<double> values;
         for (const RoundelFit* fit : fits) values.push_back(fit->*of);
-        return median_by(values, [](double value) { return value; });
+        return median_of(values);
     };
-    const double residual = median_of(&RoundelFit::edge_residual);
-    const double gain = edge_noise_ > 0 ? kMemory : 1;
-    edge_noise_ += gain * (residual - edge_noise_);
-    correlation_ += gain * (median_of(&RoundelFit::correlation) - correlation_);
+    const bool first = edge_noise_ == 0;
+    include_frame(edge_noise_, median(&RoundelFit::edge_residual), first);
+    include_frame(correlation_, median(&RoundelFit::correlation), first);
 }
 
 /// Whether the ratios of the last frame's roundels changed: those of prints do not, so the camera did.
@@ -170,7 +152,7 @@ bool CameraModel::contradicts(const std::vector<Observation>& roundels) {
     std::vector<double> scores;
     std::vector<SeenRatio> seen;
     for (const auto& [fit, track] : roundels) {
-        if (track < 0 || fit->outer.major < kMinDiameter || fit->clipped) continue;
+        if (track < 0 || !is_measured(*fit)) continue;
         const SeenRatio now{track, fit->ratio, square(fit->ratio_sigma) + square(Print::kPaper)};
         const auto last = std::find_if(last_.begin(), last_.end(), [number = track](const SeenRatio& ratio) {
             return ratio.track == number;
@@ -180,7 +162,7 @@ bool CameraModel::contradicts(const std::vector<Observation>& roundels) {
         seen.push_back(now);
     }
     last_ = std::move(seen);
-    return scores.size() >= kMinWitnesses && median_by(scores, [](double score) { return score; }) > kChanged;
+    return scores.size() >= kMinWitnesses && median_of(scores) > square(kContradiction);
 }
 
 /// Lets the next frames teach all but the prints from the start.
@@ -222,7 +204,7 @@ void CameraModel::learn_curvature(const std::vector<const RoundelFit*>& fits) {
     std::vector<double> excess;
     double least = square(kMaxCurvature);  // variance of the exponent's own error, as a curvature
     for (const RoundelFit* fit : fits) {
-        if (fit->outer.major < kMinDiameter || fit->clipped) continue;
+        if (!is_measured(*fit)) continue;
         const Print& print = nearest_print(prints_, fit->ratio);
         const double by_curvature = ratio_by_curvature(*fit, print.ratio);
         const double curvature = (fit->ratio - print.ratio) / by_curvature;
@@ -233,24 +215,23 @@ void CameraModel::learn_curvature(const std::vector<const RoundelFit*>& fits) {
     }
     surprise_ = 0;
     if (excess.empty()) return;
-    const double variance = median_by(excess, [](double value) { return value; });
+    const double variance = median_of(excess);
     surprise_ = std::max({0.0, variance - curvature_, log_exponent_ == 0 ? 0 : least});
     if (!knows_tone_) return;
-    curvature_ += (knows_curvature_ ? kMemory : 1) * (std::max(0.0, variance) - curvature_);
+    include_frame(curvature_, std::max(0.0, variance), !knows_curvature_);
     knows_curvature_ = true;
 }
 
 /// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames,
 /// are as certain as the best roundel.
 bool CameraModel::learn_tone(std::vector<ToneEstimate> measured) {
-    const double middle =
-        median_by(measured, [](const ToneEstimate& e) { return e.log_exponent; }).log_exponent;
+    const double middle = median_of(measured, &ToneEstimate::log_exponent).log_exponent;
     const double sigma = std::min_element(measured.begin(), measured.end(), [](const auto& a, const auto& b) {
                              return a.sigma < b.sigma;
                          })->sigma;
-    const double gain = sigma_ == 0 ? 1 : kMemory;
-    mean_ += gain * (middle - mean_);
-    sigma_ += gain * (sigma - sigma_);
+    const bool first = sigma_ == 0;
+    include_frame(mean_, middle, first);
+    include_frame(sigma_, sigma, first);
     const double change = std::abs(mean_ - log_exponent_);
     const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_) : kMinChange;
     knows_tone_ |= sigma_ <= kMaxSigma;

@@ -9,6 +9,7 @@
 #include "fit/photometric_fit.hpp"
 #include "fit/roundel_limits.hpp"
 #include "numeric/image.hpp"
+#include "verify/learning.hpp"
 #include "verify/light_falloff.hpp"
 #include "verify/paper_bend.hpp"
 #include "verify/print_ratios.hpp"
@@ -68,7 +69,7 @@ class CameraModel {
     static double to_power(double level, double exponent) {
         return 255 * std::pow(std::max(level, 0.0) / 255, exponent);
     }
-    void learn_remainder(bool linearization_changed);
+    void learn_remainder();
     std::optional<ToneMeasurement> measure(const RoundelFit& fit) const;
     void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
     void learn_curvature(const std::vector<const RoundelFit*>& fits);
@@ -84,7 +85,6 @@ class CameraModel {
     PaperBend bend_;
     ToneCurve tone_;
     ToneRemainder remainder_;
-    unsigned n_learned_ = 0;   // frames
     double log_exponent_ = 0;  // in use
     double mean_ = 0;          // of the measured ones
     double sigma_ = 0;         // of the mean; 0 before the first measurement

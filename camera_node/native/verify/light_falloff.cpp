@@ -6,6 +6,7 @@
 #include <numbers>
 
 #include "numeric/cholesky.hpp"
+#include "verify/learning.hpp"
 
 namespace roundel {
 
@@ -13,22 +14,12 @@ namespace {
 
 constexpr double kFirst = 2e-4;      // per pixel: a tenth across half of a picture
 constexpr double kLeast = 2e-5;      // of a gradient and of its rest
-constexpr double kMostNoise = 2e-3;  // of one measurement
 constexpr double kSlopePrior = 2;    // standard deviation of M over that of the gradient
 constexpr int kSteps = 3;            // of the prior's variances
 constexpr double kLeastLevel = 0.3;  // of the light in the middle
-constexpr double kMemory = 0.8;      // of a frame in the next one
 constexpr double kOutlier = 3;       // standard deviations, from which a roundel counts less (Cauchy)
 
-double median_of(std::vector<double>& values) {
-    const auto middle = values.begin() + ptrdiff_t(values.size() / 2);
-    std::nth_element(values.begin(), middle, values.end());
-    return *middle;
-}
-
-bool is_measured(const RoundelFit* fit) {
-    return fit->shading.variance > 0 && fit->shading.variance < square(kMostNoise);
-}
+bool shows_light(const RoundelFit* fit) { return fit->shading.variance > 0; }
 
 double dot(const auto& a, const auto& b) {
     double sum = 0;
@@ -91,22 +82,21 @@ std::pair<double, double> LightFalloff::expected(double x, double y) const {
 void LightFalloff::learn(const std::vector<const RoundelFit*>& fits, const ImageView& image) {
     set_size(image);
     std::vector<const RoundelFit*> measured;
-    std::copy_if(fits.begin(), fits.end(), std::back_inserter(measured), is_measured);
+    std::copy_if(fits.begin(), fits.end(), std::back_inserter(measured), shows_light);
     if (measured.empty()) return;
-    const double gain = knows_ ? 1 - kMemory : 1;
     const double all = variance_of(
         measured, [](const RoundelFit& fit) { return square(fit.shading.x) + square(fit.shading.y); });
-    all_ += gain * (all - all_);
+    include_frame(all_, all, !knows_);
     for (Row& row : information_)
-        for (double& value : row) value *= kMemory;
-    for (double& value : right_) value *= kMemory;
+        for (double& value : row) value *= 1 - kNewFrame;
+    for (double& value : right_) value *= 1 - kNewFrame;
     for (const RoundelFit* fit : measured) include(*fit);
     solve();
     const double rest = variance_of(measured, [this](const RoundelFit& fit) {
         const auto [x, y] = expected(fit.outer.x, fit.outer.y);
         return square(fit.shading.x - x) + square(fit.shading.y - y);
     });
-    rest_ += gain * (rest - rest_);
+    include_frame(rest_, rest, !knows_);
     knows_ = true;
 }
 

@@ -6,6 +6,7 @@
 #include <cmath>
 
 #include "fit/gauss_newton.hpp"
+#include "verify/learning.hpp"
 
 namespace roundel {
 
@@ -16,9 +17,7 @@ namespace {
 constexpr double kUnknownTilt = 0.15;
 // Squared bends over the tangent of the tilt:
 constexpr double kSmallBend = 1e-6;  // of paper bent by 0.25 % of its width, from which roundels count alike
-constexpr double kMostBend = 4e-4;   // by 5 %, which no print has
 constexpr double kChance = 2;        // standard deviations of a mean that noise explains
-constexpr double kMemory = 0.9;      // of a frame in the next one
 // Squared displacements over the squared length of the bend that shows:
 constexpr double kMeanBend = 4;      // that of the mean curvature, along the tilt
 constexpr double kOtherBend = 0.09;  // deviations from a cylinder
@@ -46,12 +45,12 @@ void PaperBend::learn(const std::vector<const RoundelFit*>& fits, double correla
         const double weight = 1 / square(noise + kSmallBend);
         now.weight += weight;
         now.scatter += square(weight * noise);
-        now.excess += weight * (std::min(fit->bend.squared / tilt, kMostBend) - noise);
+        now.excess += weight * (fit->bend.squared / tilt - noise);
     }
     if (!(now.weight > 0)) return;
-    remembered_.weight = kMemory * remembered_.weight + now.weight;
-    remembered_.excess = kMemory * remembered_.excess + now.excess;
-    remembered_.scatter = kMemory * remembered_.scatter + now.scatter;
+    remembered_.weight = (1 - kNewFrame) * remembered_.weight + now.weight;
+    remembered_.excess = (1 - kNewFrame) * remembered_.excess + now.excess;
+    remembered_.scatter = (1 - kNewFrame) * remembered_.scatter + now.scatter;
     // Other prints may be in view than before.
     squared_ = std::max(now.lower(), remembered_.lower());
 }

@@ -5,22 +5,20 @@
 #include <array>
 #include <cmath>
 
+#include "verify/learning.hpp"
+
 namespace roundel {
 
 namespace {
 
-constexpr double kMinDiameter = 12;      // pixels: ratio and blur of smaller roundels are correlated
-constexpr double kMaxRatioSigma = 0.02;  // of a measurement
 constexpr double kModelSigma = 0.003;    // of the print and of the model, common to all views of a roundel
 constexpr double kSecondOrder = 0.1;     // share of the tone curve's effect that the model leaves out
 constexpr double kCurvaturePrior = 0.6;  // standard deviation; 0.7 is a gamma of 2.2
 constexpr double kMinCurvature = -0.25;  // of the tone curves of cameras
 constexpr double kSameKind = 0.04;       // difference of ratios from the regression
 constexpr size_t kMaxKinds = 8;
-constexpr int kRecurring = 3;         // roundels of a kind in one frame
-constexpr int kMaxCount = 512;        // measurements that a regression remembers
-constexpr double kMinZoom = 0.05;     // relative change of the distance after which a roundel counts again
-constexpr double kContradiction = 3;  // standard deviations
+constexpr int kMaxCount = 512;     // measurements that a regression remembers
+constexpr double kMinZoom = 0.05;  // relative change of the distance after which a roundel counts again
 // Standard deviation of the ratio of a usual print: ink that spreads by 0.25 mm over both edges of 100 mm.
 constexpr double kDotGain = 0.008;
 constexpr double kSharper = 0.7;    // factor of the standard deviation at which an estimate replaces the last
@@ -155,9 +153,9 @@ bool PrintRatios::collect() {
 }
 
 bool PrintRatios::learn(const std::vector<Observation>& roundels) {
-    std::array<int, kMaxKinds> seen{};
+    std::array<size_t, kMaxKinds> seen{};
     for (const auto& [fit, track] : roundels) {
-        if (fit->outer.major < kMinDiameter || fit->clipped || fit->ratio_sigma > kMaxRatioSigma) continue;
+        if (!is_measured(*fit)) continue;
         const double by_curvature = ratio_by_curvature(*fit, fit->ratio);
         Kind& kind = kind_of(fit->ratio, by_curvature);
         ++seen[size_t(&kind - kinds_.data())];
@@ -166,7 +164,7 @@ bool PrintRatios::learn(const std::vector<Observation>& roundels) {
                     std::hypot(fit->ratio_sigma, kModelSigma, kSecondOrder * by_curvature));
     }
     for (size_t k = 0; k < kinds_.size(); ++k) {
-        kinds_[k].recurs |= seen[k] >= kRecurring;
+        kinds_[k].recurs |= seen[k] >= kMinWitnesses;
         if (kinds_[k].recurs && kinds_[k].count) assign(kinds_[k]);
     }
     return collect();

@@ -10,23 +10,18 @@ namespace roundel {
 
 namespace {
 
-constexpr size_t kSamples = 64, kMinSamples = 6;
-constexpr double kDarkest = 1 / 255.0;
+constexpr size_t kSamples = 64;
 constexpr int kSteps = 3;
 constexpr double kModelSigma = 0.05;    // of a curvature: what the family leaves
 constexpr double kHuber = 1.5;          // standard deviations
 constexpr double kExponent = 1.6;       // mean of the prior
 constexpr double kExponentSigma = 0.8;  // standard deviation of the prior
 constexpr double kShoulderSigma = 4;
-constexpr double kLeastExponent = 0.3, kMostExponent = 5;
-constexpr double kLeastShoulder = -0.9;  // over the exponent: light increases
-constexpr double kMostShoulder = 15;
-constexpr double kSignificant = 4;  // standard deviations
 
 }  // namespace
 
 EncodedLevel::EncodedLevel(double share) {
-    const double v = std::clamp(share, kDarkest, 1.0), cube = v * v * v;
+    const double v = std::clamp(share, 1 / 255.0, 1.0), cube = v * v * v;
     by_exponent = std::log(v);
     by_shoulder = (cube * cube - 1) / 6;
 }
@@ -45,10 +40,6 @@ double ToneCurve::light(const EncodedLevel& level) const {
 }
 
 double ToneCurve::light(double share) const { return light(EncodedLevel(share)); }
-
-bool ToneCurve::has_shoulder() const {
-    return samples_.size() >= kMinSamples && std::abs(shoulder_) > kSignificant * shoulder_sigma_;
-}
 
 double ToneCurve::left_by(double exponent) const {
     double sum = 0, weights = 0;
@@ -89,10 +80,8 @@ void ToneCurve::fit() {
             x += weight * u * off;
             y += weight * v * off;
         }
-        exponent_ = std::clamp(exponent_ + (A.yy * x - A.xy * y) / A.det(), kLeastExponent, kMostExponent);
-        shoulder_ = std::clamp(shoulder_ + (A.xx * y - A.xy * x) / A.det(), kLeastShoulder * exponent_,
-                               kMostShoulder);
-        shoulder_sigma_ = std::sqrt(A.xx / A.det());
+        exponent_ += (A.yy * x - A.xy * y) / A.det();
+        shoulder_ += (A.xx * y - A.xy * x) / A.det();
     }
 }
 

@@ -29,20 +29,17 @@ class ToneCurve {
     void include(const ToneSample& sample);
     /// Fits the curve to the samples, from its last state.
     void fit();
-    /// Whether the samples determine that the curve is no power.
-    bool has_shoulder() const;
     /// RMS of the curvatures that a power leaves in the samples, beyond their noise.
     double left_by(double exponent) const;
     double light(double share) const;
     double exponent() const { return exponent_; }
-    double shoulder() const { return shoulder_; }
 
   private:
     double light(const EncodedLevel& level) const;
 
     std::vector<ToneSample> samples_;
     size_t next_ = 0;  // of the samples, to be replaced
-    double exponent_ = 1, shoulder_ = 0, shoulder_sigma_ = 0;
+    double exponent_ = 1, shoulder_ = 0;
 };
 
 }  // namespace roundel
