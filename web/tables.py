@@ -167,19 +167,18 @@ def describe_silence(seconds: float) -> str:
 
 
 def _advise(own_advice: str, health: CameraHealth | None) -> str:
-    if health is not None and not health.calibrated:
-        return "not calibrated"
-    if health is not None and health.excluded:
-        return "moved: excluded until it is recalibrated"
-    if health is not None and health.frozen:
-        return "repeats an old image: excluded until it delivers new ones"
-    if health is not None and health.clock == "excluded":
-        return "its stamps jumped: excluded until they are corrected"
-    if health is not None and health.clock == "corrected":
-        return f"its stamps are corrected by {health.clock_correction_ms:.1f} ms: check its clock"
-    if health is not None and health.duplicate_publisher:
-        return "two nodes use this name"
-    return own_advice
+    if health is None:
+        return own_advice
+    reasons = {
+        "not calibrated": not health.calibrated,
+        "moved: excluded until it is recalibrated": health.excluded,
+        "repeats an old image: excluded until it delivers new ones": health.frozen,
+        "its stamps jumped: excluded until they are corrected": health.clock == "excluded",
+        f"its stamps are corrected by {health.clock_correction_ms:.1f} ms: check its clock": health.clock
+        == "corrected",
+        "two nodes use this name": health.duplicate_publisher,
+    }
+    return next((reason for reason, holds in reasons.items() if holds), own_advice)
 
 
 def describe_server(state: ArenaState) -> str:

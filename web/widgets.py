@@ -12,13 +12,14 @@ from typing import Any, Generic, TypeVar
 
 import viser
 
-from camera_node.foundation.errors import RoundelError
+from camera_node.foundation.errors import RoundelError, printable
 from web.errors import WebError
 from web.html_tables import small
 from web.state.feed import ArenaState
 
 log = logging.getLogger("web")
 GREY, PRIMARY = (58, 63, 74), None  # colours of buttons; None is the theme's primary colour
+MAX_LABEL = 48  # characters of a change on a button
 Result = TypeVar("Result")
 # What is stored of a control and what is sent to browsers must have one order: two threads that set a property at once
 # would leave a browser with the value that the page no longer has, and that it therefore never sends again.
@@ -171,6 +172,30 @@ class ConfirmedButton(ActionButton):
             return f"click again to {self._label.split()[0].lower()} {asked[1]}{self._consequence}"
         self._asked = None
         return self._confirmed()
+
+
+class UndoButton(ActionButton):
+    """Reverts what was changed beside it, the latest change first; its label names that change."""
+
+    def __init__(self, gui: viser.GuiApi, label: str, answer: Answer) -> None:
+        super().__init__(gui, label, self._undo, answer)
+        self._label = label
+        self._changes: list[tuple[str, Callable[[], object]]] = []
+
+    def note(self, about: str, revert: Callable[[], object]) -> str:
+        """Remember a change in words, and what reverts it or raises RoundelError; returns the words."""
+        self._changes.append((about, revert))
+        return about
+
+    def update(self) -> None:
+        """Name the change that would be reverted."""
+        last = f": {printable(self._changes[-1][0], MAX_LABEL)}" if self._changes else ""
+        self.show(enabled=bool(self._changes), label=self._label + last)
+
+    def _undo(self) -> str:
+        about, revert = self._changes.pop()
+        revert()
+        return f"undone: {about}"
 
 
 class LongAction:

@@ -50,7 +50,8 @@ def main(pictures: Path | None = None, recording: Path | None = None) -> None:
             outcome = play(arena, folder, show)
     circle = outcome.circle
     print(
-        f"{outcome.calibration}\n{outcome.n_poses} poses: radius {1e3 * circle.radius_m:.2f} of "
+        f"{outcome.calibration}\n{outcome.clicks} clicks, 2 commands\n"
+        f"{outcome.n_poses} poses: radius {1e3 * circle.radius_m:.2f} of "
         f"{1e3 * RADIUS_M:.0f} mm, {1e3 * circle.rms_m:.2f} mm RMS from the circle, {circle.round_s:.3f} s a round"
     )
 

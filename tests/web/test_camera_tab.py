@@ -86,7 +86,11 @@ def test_pictures_and_settings_of_a_camera(arena: LiveArena, view: View, east: S
         exposure.press("Enter")
         page.get_by_role("button", name="Apply").click()
         page.get_by_text("exposure 3000 us, 0 masked places").wait_for()
-        east.used = msgspec.structs.replace(east.used, exposure_us=4000.0)
+        undo = page.get_by_role("button", name="Undo the change of a camera")
+        wait_for(undo.is_enabled, speak)
+        undo.click()
+        page.get_by_text("undone: exposure, gain and contrast of east").wait_for()
+        assert east.used.exposure_us == 4000.0
         page.get_by_role("button", name="Read the settings").click()
         page.get_by_text("exposure 4000 us, 0 masked places").wait_for()
         page.get_by_role("button", name="Mask everything detected now").click()
@@ -100,9 +104,9 @@ def test_pictures_and_settings_of_a_camera(arena: LiveArena, view: View, east: S
         wait_for(lambda: not is_matched(publisher))
     assert value_of(view, "Show what the cameras see")
     assert east.changes[0].exposure_us == 3000.0
-    polygon = np.array(east.changes[1].mask)[0]
+    polygon = np.array(east.changes[2].mask)[0]
     assert cv2.pointPolygonTest(polygon.astype(np.float32), ROUNDEL, False) > 0
-    assert east.changes[2].mask == ()
+    assert east.changes[3].mask == ()
     wait_for(lambda: not is_matched(publisher))
     publisher.undeclare()
 

@@ -10,6 +10,7 @@ import viser
 from calib.plan.planner import DIAMETER_M, PlannedArena, plan_around
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array, Index
+from web.scene.markers import add_points
 from web.state.feed import ArenaState
 
 POINTS = 2500  # of the volume, about
@@ -37,15 +38,7 @@ class CoverageVolume:
             False,
             hint=f"places of level roundels of {DIAMETER_M:g} m: orange for one camera, yellow for two, green for more",
         )
-        self.cloud = server.scene.add_point_cloud(
-            "/coverage",
-            np.zeros((1, 3), np.float32),
-            np.zeros((1, 3), np.uint8),
-            point_size=POINT_M,
-            point_shape="circle",
-            precision="float32",
-            visible=False,
-        )
+        self.cloud = add_points(server.scene, "/coverage", MANY, POINT_M)
         self._rig: Rig | None = None
         self._volume: tuple[Rig, Array, Index] | None = None  # set by the thread, as one object
 

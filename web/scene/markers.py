@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import ArrayLike
 
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.pose import rotation_with_z, wxyz_from_rotation
@@ -32,20 +33,35 @@ def free_markers(state: ArenaState) -> Mask:
     return ~is_declared[message.robot_index()]  # -1, of unlabeled markers, is the last one
 
 
+def add_points(
+    scene: viser.SceneApi, name: str, colour: tuple[int, int, int], size_m: float
+) -> viser.PointCloudHandle:
+    """Add a cloud of round points, which is not visible before `show_points`."""
+    return scene.add_point_cloud(
+        name,
+        np.zeros((1, 3), np.float32),
+        colour,
+        point_size=size_m,
+        point_shape="circle",
+        precision="float32",
+        visible=False,
+    )
+
+
+def show_points(cloud: viser.PointCloudHandle, points: ArrayLike) -> None:
+    """Show points (N, 3) as a cloud; none hide it."""
+    places = np.array(points, np.float32).reshape(-1, 3)
+    cloud.visible = bool(len(places))
+    if len(places):
+        cloud.points = places
+
+
 class MarkerCloud:
     """Markers as one point cloud: white if a robot has the marker, grey if it is unlabeled. Prints of declared robots
     are not in it."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._cloud = scene.add_point_cloud(
-            "/markers",
-            np.zeros((1, 3), np.float32),
-            np.zeros((1, 3), np.uint8),
-            point_size=0.035,
-            point_shape="circle",
-            precision="float32",
-            visible=False,
-        )
+        self._cloud = add_points(scene, "/markers", LABELED, 0.035)
 
     def draw(self, state: ArenaState) -> None:
         """Draw the latest markers, if they are recent."""
@@ -115,18 +131,9 @@ class TruePoints:
         for name in self.clouds.keys() - objects.keys():
             self.clouds.pop(name).remove()
         for name, points in objects.items():
-            points = np.array(points, np.float32).reshape(-1, 3)
-            if name in self.clouds:
-                self.clouds[name].points = points
-            elif len(points):
-                self.clouds[name] = self.scene.add_point_cloud(
-                    f"/true/{name}",
-                    points,
-                    TRUE_POINT,
-                    point_size=0.05,
-                    point_shape="circle",
-                    precision="float32",
-                )
+            if name not in self.clouds:
+                self.clouds[name] = add_points(self.scene, f"/true/{name}", TRUE_POINT, 0.05)
+            show_points(self.clouds[name], points)
 
 
 class RelativeFrames:

@@ -141,10 +141,10 @@ class Feed:
             keys.robot_pose(): (RobotPose, self._store_pose),
             keys.markers: (Markers, self._store_as("markers")),
             keys.fusion_status: (FusionStatus, self._store_status),
-            keys.camera_status(): (CameraStatus, self._store_camera_status),
+            keys.camera_status(): (CameraStatus, self._store_by("cameras", "camera")),
             keys.detections(): (Detections, self._add_coverage),
-            keys.relative(): (RelativePositions, self._store_relative),
-            keys.preview(): (Preview, self._store_preview),
+            keys.relative(): (RelativePositions, self._store_by("relative", "camera")),
+            keys.preview(): (Preview, self._store_by("previews", "camera")),
             keys.rig: (RigMessage, self._store_rig),
             robots_key(arena): (Robots, self._store_robots),
             progress_key(arena): (DemoProgress, self._store_as("progress")),
@@ -235,7 +235,7 @@ class Feed:
         return lambda message, key: setattr(self._state, name, TimedMessage(message, self._received_s))
 
     def _store_pose(self, pose: RobotPose, key: str) -> None:
-        self._store_named(self._state.poses, pose.robot, pose, key)
+        self._store_by("poses", "robot")(pose, key)
         if self._on_pose is not None:
             self._on_pose(pose)
 
@@ -251,15 +251,6 @@ class Feed:
             if self._clock() - state.cameras[camera].received_s > REMOVED_CAMERA_S:
                 for messages in (state.cameras, state.previews, state.detections, state.coverage):
                     messages.pop(camera, None)
-
-    def _store_camera_status(self, status: CameraStatus, key: str) -> None:
-        self._store_named(self._state.cameras, status.camera, status, key)
-
-    def _store_preview(self, preview: Preview, key: str) -> None:
-        self._store_named(self._state.previews, preview.camera, preview, key)
-
-    def _store_relative(self, message: RelativePositions, key: str) -> None:
-        self._store_named(self._state.relative, message.camera, message, key)
 
     def _add_coverage(self, detections: Detections, key: str) -> None:
         camera, size = detections.camera, (detections.width, detections.height)
@@ -285,11 +276,15 @@ class Feed:
         if message.robots != self._state.declared:
             self._state.declared = message.robots
 
-    def _store_named(
-        self, messages: dict[str, TimedMessage], name: str, message: msgspec.Struct, key: str
-    ) -> None:
-        _check_name(messages, name, key)
-        messages[name] = TimedMessage(message, self._received_s)
+    def _store_by(self, messages: str, field: str) -> Callable[[msgspec.Struct, str], None]:
+        """Store messages in a dictionary of the state, by a name that they have in a field."""
+
+        def store(message: msgspec.Struct, key: str) -> None:
+            known, name = getattr(self._state, messages), getattr(message, field)
+            _check_name(known, name, key)
+            known[name] = TimedMessage(message, self._received_s)
+
+        return store
 
 
 def _check_name(known: dict[str, Any], name: str, key: str) -> None:

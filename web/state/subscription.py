@@ -173,30 +173,32 @@ class Subscription:
         return t_ns != state.rig_t_ns or state.history is None or state.history.rig_t_ns != t_ns
 
     def _request_rig(self, session: zenoh.Session) -> None:
-        key = self.feed.keys.rig
-        if not self._rig_requests.passes():
-            return
+        keys = self.feed.keys
 
-        def request(arena: str) -> None:
-            with contextlib.suppress(RoundelError):  # the next status asks again
-                if (data := request_rig_message(session, arena, RIG_TIMEOUT_S)) is not None:
-                    self.feed.receive(key, key, data)
-                    self.feed.store_history(request_rig_history(session, arena, RIG_TIMEOUT_S))
+        def request() -> None:
+            if (data := request_rig_message(session, keys.arena, RIG_TIMEOUT_S)) is not None:
+                self.feed.receive(keys.rig, keys.rig, data)
+                self.feed.store_history(request_rig_history(session, keys.arena, RIG_TIMEOUT_S))
 
-        # In a thread: Zenoh's thread, which calls this method, must not wait for replies.
-        request_rig = guarded("a request for the rig", request)
-        threading.Thread(target=request_rig, args=[self.feed.keys.arena], name="rig", daemon=True).start()
+        _ask(self._rig_requests, "rig", request)
 
     def _request_robots(self, session: zenoh.Session) -> None:
-        if not self._robots_requests.passes():
-            return
+        def request() -> None:
+            self.feed.store_robots(request_robots(session, self.feed.keys.arena, REQUEST_TIMEOUT_S))
 
-        def request(arena: str) -> None:
-            with contextlib.suppress(RoundelError):  # a later status asks again
-                self.feed.store_robots(request_robots(session, arena, REQUEST_TIMEOUT_S))
+        _ask(self._robots_requests, "robots", request)
 
-        ask = guarded("a request for the robots", request)
-        threading.Thread(target=ask, args=[self.feed.keys.arena], name="robots", daemon=True).start()
+
+def _ask(limit: RateLimit, what: str, request: Callable[[], None]) -> None:
+    """Request something in a thread, unless too often: Zenoh's thread, which calls this, must not wait for replies."""
+
+    def ask(_: None) -> None:
+        with contextlib.suppress(RoundelError):  # a later status asks again
+            request()
+
+    asking = guarded(f"a request for the {what}", ask)
+    if limit.passes():
+        threading.Thread(target=asking, args=[None], name=what, daemon=True).start()
 
 
 def _describe_step(word: str, version: RigVersion | None) -> str:

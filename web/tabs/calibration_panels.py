@@ -20,7 +20,7 @@ from web.html_tables import Column, HtmlTable, TableRow, small
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tables import NO_VALUE
-from web.widgets import ActionButton, Answer, set_content
+from web.widgets import MAX_LABEL, ActionButton, Answer, set_content
 
 HISTORY_COLUMNS = (
     Column("made", "", "when the rig was calibrated or changed"),
@@ -29,7 +29,6 @@ HISTORY_COLUMNS = (
     Column("file", "", "on the server; none if a restart loses it"),
 )
 UNDO, REDO = "Undo the last change", "Redo"
-MAX_LABEL = 48  # characters of a change on a button
 LEVELS = {"earlier": "wait", "in force": "ok", "undone": "warn"}
 
 

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import copy_context
+from functools import partial
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ from camera_node.protocol.messages import Preview, Settings
 from camera_node.protocol.registration import CameraChange
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import guarded
+from web.errors import WebError
 from web.html_tables import MARGIN_PX
 from web.own_control import OwnControl, each_browser
 from web.scene.camera_frustums import CameraDrawing
@@ -31,7 +33,7 @@ from web.tables import STALE_S, tabulate_cameras
 from web.tabs.calibration_panels import CalibrationFiles
 from web.tabs.lens_panel import LensPanel
 from web.tabs.mask_editor import MaskEditor
-from web.widgets import ActionButton, Answer, ConfirmedButton, inside, set_content, set_property
+from web.widgets import ActionButton, Answer, ConfirmedButton, UndoButton, inside, set_content, set_property
 
 NO_CAMERA = "no camera yet"
 FIELDS: tuple[Callable[[viser.GuiApi], Any], ...] = (  # name, exposure, gain, contrast
@@ -146,7 +148,10 @@ class CameraSettings:
                 ActionButton(gui, "Take a snapshot", self._show_snapshot, answer),
             )
             self._image: viser.GuiImageHandle | None = None
-            self._mask = MaskEditor(server, subscription, lambda: self._name, self._request_picture)
+            self._undo = UndoButton(gui, "Undo the change of a camera", answer)
+            self._mask = MaskEditor(
+                server, subscription, lambda: self._name, self._request_picture, self.change_settings
+            )
             self._lens = LensPanel(server, subscription, files, lambda: self._name) if files else None
 
     def update(self, state: ArenaState) -> None:
@@ -156,6 +161,7 @@ class CameraSettings:
         self._camera.offer(names, NO_CAMERA)
         for button in self._buttons:
             button.show(enabled=bool(state.cameras))
+        self._undo.update()
         self._forget.show(enabled=bool(names))
         show = guarded("the settings of a camera", self._show_present)
         for client in each_browser(self._server):
@@ -179,7 +185,23 @@ class CameraSettings:
         require_name(new, "a camera")
         self._change(CameraChange(camera=old, name=new, source=RequestSource.of("web")))
         self._new_name.here.value = ""
-        return f"{old} is called {new} from now on"
+        back = CameraChange(camera=new, name=old, source=RequestSource.of("web"))
+        return self._undo.note(f"{old} is called {new} from now on", lambda: self._change(back))
+
+    def change_settings(self, name: str, wanted: Settings, about: str) -> Settings:
+        """Change settings of a camera so that they can be undone; returns those in use, raises as `Subscription`."""
+        before = self._subscription.change_settings(name)
+        after = self._subscription.change_settings(name, wanted)
+        self._undo.note(f"{about} of {name}", partial(self._restore, name, before, after))
+        return after
+
+    def _restore(self, name: str, before: Settings, after: Settings) -> None:
+        if self._subscription.change_settings(name) != after:
+            raise WebError(f"{name} was changed since, by another program or page: nothing is undone")
+        if self._subscription.change_settings(name, before) != before:
+            raise WebError(
+                f"{name} can't return to an automatic exposure or gain from here; the rest is undone"
+            )
 
     def forget(self) -> str:
         """Have the server forget the camera. Raises RequestError or NetworkError."""
@@ -209,7 +231,7 @@ class CameraSettings:
             gain=self._gain.here.value or None,
             min_contrast=self._contrast.here.value,
         )
-        return self._show(self._subscription.change_settings(self._name, wanted))
+        return self._show(self.change_settings(self._name, wanted, "exposure, gain and contrast"))
 
     @property
     def _name(self) -> str:

@@ -23,6 +23,7 @@ from web.condition import next_step
 from web.html_tables import small
 from web.own_control import OwnControl
 from web.scene.clicks import nearest_to_ray
+from web.scene.markers import add_points, show_points
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_content, set_property
@@ -67,14 +68,7 @@ class MarkerPicker:
                 self._answer,
                 "measures all unlabeled markers for 1.5 s and makes one robot of those that stand still",
             )
-        self._cloud = server.scene.add_point_cloud(
-            "/selected",
-            np.zeros((1, 3), np.float32),
-            SELECTED,
-            point_size=0.06,
-            point_shape="circle",
-            visible=False,
-        )
+        self._cloud = add_points(server.scene, "/selected", SELECTED, 0.06)
         self._button.on_click(lambda _: self._toggle())
         server.scene.on_click()(lambda click: self.select(click.ray_origin, click.ray_direction))
 
@@ -90,9 +84,7 @@ class MarkerPicker:
         set_property(self._button, "disabled", not self._active and not len(self._unlabeled))
         self._everything.show(enabled=len(self._unlabeled) > 0)
         self._define_selected.show(enabled=bool(self.selected), primary=bool(self.selected))
-        self._cloud.visible = bool(self.selected)
-        if self.selected:
-            self._cloud.points = np.array(self.selected, np.float32)
+        show_points(self._cloud, self.selected)
 
     def select(self, origin: ArrayLike, direction: ArrayLike) -> None:
         """Select the marker nearest to a ray (world), or deselect it."""

@@ -45,6 +45,7 @@ class MaskEditor:
         subscription: connected to the arena.
         camera: returns the name of the selected camera.
         picture: returns the current picture of a camera, (h, w, 3) RGB, or raises NetworkError.
+        change: changes settings of a camera, with words for what changes; returns those in use.
     """
 
     def __init__(
@@ -53,7 +54,9 @@ class MaskEditor:
         subscription: Subscription,
         camera: Callable[[], str],
         picture: Callable[[str], NDArray[np.uint8]],
+        change: Callable[[str, Settings, str], Settings],
     ) -> None:
+        self._change = change
         self._subscription, self._camera, self._picture = subscription, camera, picture
         self._plane: PicturePlane | None = None
         self._edited = ""  # name of the camera whose picture is shown
@@ -150,7 +153,7 @@ class MaskEditor:
         return self._set_mask(name, (*(self._subscription.change_settings(name).mask or ()), *polygons))
 
     def _set_mask(self, name: str, mask: tuple[Polygon, ...]) -> str:
-        used = self._subscription.change_settings(name, Settings(mask=mask)).mask or ()
+        used = self._change(name, Settings(mask=mask), "the mask").mask or ()
         if name == self._edited:
             self._mask = used
             self._redraw()

@@ -2,14 +2,13 @@
 """The tab Robots: changes of declared robots, and how they are undone."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from pathlib import Path
 
 import viser
 
 from camera_node.foundation.config import require_name
-from camera_node.foundation.errors import printable
 from fusion.errors import FusionError
 from fusion.model.robots import Robot, move_origin, save_robots, turn_heading
 from fusion.protocol.pose_messages import Robots, RobotsRequest
@@ -17,32 +16,14 @@ from web.own_control import OwnControl
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tables import NO_ROBOT
-from web.tabs.calibration_panels import MAX_LABEL
 from web.tabs.robot_selection import RobotSelection
-from web.widgets import ActionButton, Answer, ConfirmedButton
-
-UNDO = "Undo the change of a robot"
+from web.widgets import ActionButton, Answer, ConfirmedButton, UndoButton
 
 
 def _numbered(path: Path) -> Iterator[Path]:
     """robots.yaml, robots-1.yaml, robots-2.yaml and so on."""
     yield path
     yield from (path.with_stem(f"{path.stem}-{k}") for k in count(1))
-
-
-@dataclass(frozen=True)
-class RobotChange:
-    """A change that this page made, and how to undo it.
-
-    Attributes:
-        about: the change in words.
-        undo: the request that reverts it.
-        after: the robots that it left, None for one that it deleted.
-    """
-
-    about: str
-    undo: RobotsRequest
-    after: dict[str, Robot | None]
 
 
 class RobotEditor:
@@ -59,7 +40,6 @@ class RobotEditor:
         self, server: viser.ViserServer, subscription: Subscription, folder: Path, selection: RobotSelection
     ) -> None:
         self._subscription, self._file, self._selection = subscription, folder / "robots.yaml", selection
-        self._changes: list[RobotChange] = []
         gui, answer = server.gui, Answer(server.gui)
         place = gui.add_folder("One robot", expand_by_default=False)
         with place:
@@ -78,7 +58,7 @@ class RobotEditor:
                 gui, "Delete the selected robots", lambda: ", ".join(selection.names), self.delete_all, answer
             )
         self._save = ActionButton(gui, "Save all robots", self.save, answer, f"writes {self._file}")
-        self.undo_button = ActionButton(gui, UNDO, self.undo, answer)
+        self.undo_button = UndoButton(gui, "Undo the change of a robot", answer)
 
     def update(self, state: ArenaState) -> None:
         """Offer the declared robots, and say which change would be undone."""
@@ -87,8 +67,7 @@ class RobotEditor:
         for button in (*self._one, self._save):
             button.show(enabled=bool(names))
         self._delete.show(enabled=bool(self._selection.names))
-        last = f": {printable(self._changes[-1].about, MAX_LABEL)}" if self._changes else ""
-        self.undo_button.show(enabled=bool(self._changes), label=UNDO + last)
+        self.undo_button.update()
 
     def rename(self) -> str:
         """Rename the robot; it stays tracked."""
@@ -120,16 +99,14 @@ class RobotEditor:
         about = f"the x axis of {name} turned by {degrees:g} degrees"
         return self._reframe(name, lambda robot: turn_heading(robot, degrees), about)
 
-    def undo(self) -> str:
-        """Revert the latest change of this page that is not undone yet, unless its robots were changed since."""
-        change = self._changes.pop()
+    def _revert(self, undo: RobotsRequest, after: dict[str, Robot | None]) -> None:
+        """Send a request, unless the robots are no longer those `after` the change."""
         present = self._subscription.declared_robots().robots
-        changed = [name for name, robot in change.after.items() if present.get(name) != robot]
-        if changed:
+        if changed := [name for name, robot in after.items() if present.get(name) != robot]:
             raise FusionError(
                 f"{', '.join(changed)} changed since, by another program or page: nothing is undone"
             )
-        return self._describe(self._subscription.change_robots(change.undo), f"undone: {change.about}")
+        self._subscription.change_robots(undo)
 
     def save(self) -> str:
         """Write all robots to robots.yaml; an existing file gets the next free number."""
@@ -158,12 +135,10 @@ class RobotEditor:
         return self._note(robots, about, RobotsRequest(define=before, replace=True), name)
 
     def _note(self, robots: Robots, about: str, undo: RobotsRequest, *names: str) -> str:
-        self._changes.append(RobotChange(about, undo, {name: robots.robots.get(name) for name in names}))
-        return self._describe(robots, about)
-
-    def _describe(self, robots: Robots, change: str) -> str:
-        unsaved = "; not saved on the server: use Save all robots" if robots.unsaved else ""
-        return f"{change}{unsaved}"
+        self.undo_button.note(
+            about, partial(self._revert, undo, {name: robots.robots.get(name) for name in names})
+        )
+        return f"{about}{'; not saved on the server: use Save all robots' if robots.unsaved else ''}"
 
 
 def _add_pivot(gui: viser.GuiApi) -> viser.GuiVector3Handle:

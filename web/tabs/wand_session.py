@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from calib.live.collect import running_camera_sizes
 from calib.live.live_session import SessionProgress, run_wand_session
@@ -27,6 +26,7 @@ from web.condition import next_step
 from web.errors import WebError
 from web.html_tables import Column, HtmlTable, TableRow
 from web.scene.camera_frustums import CameraDrawing
+from web.scene.markers import add_points, show_points
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
@@ -215,12 +215,15 @@ def describe_calibration(calibration: dict[str, Any]) -> str:
 
 
 class WandDrawing:
-    """The wand in the scene; nothing before the first `draw`."""
+    """The wand in the scene and its trail; nothing before the first `draw`."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._scene = scene
-        self._trail = np.empty((0, 3), np.float32)
-        self._handles: dict[str, viser.SceneNodeHandle] = {}
+        self._trail = np.empty((0, 3))
+        self._markers = add_points(scene, "/wand/markers", PREVIEW, MARKER_M)
+        self._path = add_points(scene, "/wand/trail", WAND_TRAIL, TRAIL_M)
+        self._line = scene.add_line_segments(
+            "/wand/line", np.zeros((1, 2, 3), np.float32), PREVIEW, thickness=LINE_M, visible=False
+        )
 
     @property
     def n_places(self) -> int:
@@ -228,34 +231,18 @@ class WandDrawing:
         return len(self._trail)
 
     def clear(self) -> None:
-        """Remove the wand and its trail."""
-        self._trail = np.empty((0, 3), np.float32)
-        for handle in self._handles.values():
-            handle.remove()
-        self._handles = {}
+        """Hide the wand and forget its trail."""
+        self._trail = np.empty((0, 3))
+        self.draw(None)
 
     def draw(self, markers: Array | None) -> None:
         """Draw the markers (M, 3), world, of which those that are NaN were not seen; None hides the wand."""
         points = np.empty((0, 3)) if markers is None else markers[np.isfinite(markers[:, 0])]
-        for name in ("markers", "line"):
-            if name in self._handles:
-                self._handles.pop(name).remove()
-        if not len(points):
-            return
-        points = np.asarray(points, np.float32)
-        self._handles["markers"] = self._add_points("markers", points, PREVIEW, MARKER_M)
+        if len(points):
+            self._trail = np.vstack([self._trail, points.mean(axis=0)])[-MAX_TRAIL:]
+        show_points(self._markers, points)
+        show_points(self._path, self._trail)
+        self._line.visible = len(points) > 1
         if len(points) > 1:
             ends = points[[np.linalg.norm(points - points[0], axis=1).argmax(), 0]]
-            self._handles["line"] = self._scene.add_line_segments(
-                "/wand/line", ends[None], PREVIEW, thickness=LINE_M
-            )
-        trail = np.concatenate([self._trail, points.mean(axis=0, keepdims=True)])
-        self._trail = np.asarray(trail[-MAX_TRAIL:], np.float32)
-        self._handles["trail"] = self._add_points("trail", self._trail, WAND_TRAIL, TRAIL_M)
-
-    def _add_points(
-        self, name: str, points: NDArray[np.float32], colour: tuple[int, int, int], size_m: float
-    ) -> viser.PointCloudHandle:
-        return self._scene.add_point_cloud(
-            f"/wand/{name}", points, colour, point_size=size_m, point_shape="circle", precision="float32"
-        )
+            self._line.points = ends[None].astype(np.float32)

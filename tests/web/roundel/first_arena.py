@@ -152,7 +152,12 @@ class Operator:
     Args:
         page: the open page.
         picture: called with the name of each step that the documentation shows.
+
+    Attributes:
+        clicks: so far, with those on tabs; a text that is typed is none.
     """
+
+    clicks = 0
 
     def __init__(self, page: Page, picture: Callable[[str], object] = lambda name: None) -> None:
         self._page, self._picture = page, picture
@@ -178,7 +183,7 @@ class Operator:
         accept = self._button("Accept the calibration")
         expect(accept, self._page.locator("body").inner_text()).to_be_enabled(timeout=STEP_MS)
         self._picture("calibrate")
-        accept.click()
+        self._click("Accept the calibration")
         outcome = self._page.get_by_text("in force on the server")
         outcome.wait_for(timeout=STEP_MS)
         return outcome.inner_text()
@@ -201,19 +206,23 @@ class Operator:
     def program(self) -> str:
         """The program that the page offers."""
         self._tab("Status")
-        self._page.get_by_text("Poses for your program").click(timeout=STEP_MS)
+        self._press(self._page.get_by_text("Poses for your program"))
         text = self._page.locator("pre").filter(has_text="Arena.connect")
         text.wait_for(timeout=STEP_MS)
         return text.inner_text()
 
     def _tab(self, name: str) -> None:
-        self._page.get_by_role("tab", name=name).click(timeout=STEP_MS)
+        self._press(self._page.get_by_role("tab", name=name))
 
     def _button(self, name: str) -> Locator:
         return self._page.get_by_role("button", name=name, exact=True)
 
     def _click(self, name: str) -> None:
-        self._button(name).click(timeout=STEP_MS)
+        self._press(self._button(name))
+
+    def _press(self, control: Locator) -> None:
+        control.click(timeout=STEP_MS)
+        self.clicks += 1
 
 
 class FirstArena:
@@ -260,8 +269,13 @@ class FirstArena:
             browser = playwright.chromium.launch(executable_path=script, args=FLAGS)
             page = browser.new_page(viewport={"width": 1600, "height": 1000})
             page.goto(f"http://127.0.0.1:{self.port}")
-            yield page
-            browser.close()
+            try:
+                yield page
+            except BaseException:
+                print(f"the page shows:\n{page.inner_text('body')}")
+                raise
+            finally:
+                browser.close()
 
     def run_program(self, code: str, is_enough: Callable[[list[str]], bool]) -> list[str]:
         """Run a program on the server's machine until it printed enough lines; return them."""
@@ -323,12 +337,14 @@ class Outcome:
         expected_mm: the largest error that the calibration states.
         circle: through the positions that the program printed while the robot drove.
         n_poses: their number.
+        clicks: of the operator.
     """
 
     calibration: str
     expected_mm: float
     circle: Circle
     n_poses: int
+    clicks: int
 
 
 def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]) -> Outcome:
@@ -350,7 +366,11 @@ def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]
         picture(page, "status")
     rig = load_rig(folder / "lab" / "rig.yaml")
     return Outcome(
-        calibration, rig.calibration["expected_mm"]["worst"], fit_circle(t_ns, positions), len(t_ns)
+        calibration,
+        rig.calibration["expected_mm"]["worst"],
+        fit_circle(t_ns, positions),
+        len(t_ns),
+        operator.clicks,
     )
 
 
