@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <span>
 
 #include "search/ray_fit.hpp"
 #include "verify/level_check.hpp"
@@ -18,10 +17,6 @@ constexpr size_t kMaxLost = 8;         // lost roundels of a frame that are sear
 constexpr int kMaxMovingFits = 32;     // of streaks in a frame,
 constexpr int kMaxFailures = 3;        // of which so many may fail; but one, unless one succeeded,
 constexpr double kPoorMisfit = 0.085;  // from this misfit on: 5 % of moving roundels have more, and clutter
-
-// Least contrast of the further rings of a bullseye: blur makes thin rings, and paper between them, grey.
-// Both are tried for a ring of no known print, which is more often one of a bullseye.
-constexpr double kRingDepths[] = {0.3, 0.5};
 
 constexpr int kOverlap = 64;            // rows that a searched band shares with the one before
 constexpr int kSearchInterval = 16;     // frames in which all of the image is searched once
@@ -300,11 +295,7 @@ bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameStat
     if (!fit || frame.found.size() >= kMaxRoundels) return false;
     if (frame.suppression.contains(fit->outer.x, fit->outer.y)) return false;
     if (track < 0 && !has_black_ink(*fit)) return false;
-    const bool known = has_known_ratio(*fit, limits_);
-    const auto depths = std::span(kRingDepths).first(known ? 1 : std::size(kRingDepths));
-    if (std::any_of(depths.begin(), depths.end(),
-                    [&](double depth) { return is_bullseye(frame.image, *fit, depth); }))
-        return false;
+    if (is_bullseye(frame.image, *fit, has_known_ratio(*fit, limits_))) return false;
     if (fit->provisional) {
         const auto is_same = [&](const RoundelFit& other) {
             return std::hypot(other.outer.x - fit->outer.x, other.outer.y - fit->outer.y) <

@@ -18,12 +18,10 @@ constexpr Print kThinnest{0.8};
 constexpr Print kThickest{0.2};
 constexpr double kMinDiameter = 6;
 constexpr double kMaxDiameter = 10000;
-constexpr double kMinContrast = 8;
 constexpr double kNoiseSpan = 6;     // standard deviations: contrast of a ring that noise does not make
-constexpr double kRingDepth = 0.3;   // of a bullseye's further rings
 constexpr double kSameCentre = 0.3;  // minor axes, for two ellipses of one ring
 constexpr double kSameSize = 1.5;    // factor, for two ellipses of one ring
-constexpr size_t kMaxCandidates = 4096, kMaxRefused = 512;
+constexpr size_t kMaxCandidates = 4096;
 
 RoundelLimits ring_limits(double noise) {
     RoundelLimits limits;
@@ -31,7 +29,7 @@ RoundelLimits ring_limits(double noise) {
     limits.ratio_tolerance = 0.1;
     limits.min_diameter = kMinDiameter;
     limits.max_diameter = kMaxDiameter;
-    limits.min_contrast = std::max(kMinContrast, kNoiseSpan * noise);
+    limits.min_contrast = kNoiseSpan * noise;
     return limits;
 }
 
@@ -43,7 +41,7 @@ std::optional<RefusedRing> refuse(const ImageView& image, const InitialGuess& gu
     start.camera = context.camera.prior_at(guess.outer.x, guess.outer.y);
     start.camera.prints = {};
     if (const auto accepted = fit_roundel(image, start, context, false)) {
-        const bool bullseye = is_bullseye(image, *accepted, kRingDepth);
+        const bool bullseye = is_bullseye(image, *accepted, has_known_ratio(*accepted, context.limits));
         if (!bullseye && has_black_ink(*accepted)) return std::nullopt;
         return RefusedRing{accepted->outer, accepted->ratio, accepted->contrast(), 0,
                            bullseye ? Refusal::kBullseye : Refusal::kPaleInk};
@@ -72,8 +70,7 @@ std::vector<RefusedRing> explain_refusals(const ImageView& image, const Acceptan
     size_t left = kMaxCandidates;
     for (const Seed& seed : chords.seeds()) {
         if (accepted.contains_fast(double(seed.x), double(seed.y))) continue;
-        if (left == 0 || refused.size() == kMaxRefused) break;
-        --left;
+        if (left-- == 0) break;
         const auto guess = fit_rays(image, seed, limits);
         if (!guess || is_listed(guess->outer) || accepted.contains(guess->outer.x, guess->outer.y)) continue;
         if (const auto ring = refuse(image, *guess, context))

@@ -12,20 +12,19 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMisfit = 0.045;          // of the contrast: RMS residual on the ring's edges
-constexpr double kRaggedMisfit = 0.062;    // the same for smoothed edges
-constexpr double kMinRagged = 16;          // pixels: smaller ragged rings may be letters
-constexpr double kMaxGrowth = 2.5;         // factor of the misfit allowed for the largest roundels, and
-constexpr double kMaxRaggedGrowth = 1.5;   // for smoothed ones
-constexpr double kMaxOffset = 0.15;        // pixels: RMS displacement of an edge around its ellipse
-constexpr double kMaxOffsetRadius = 0.04;  // the same for the smallest, over the radius
-constexpr double kChance = 2;              // times the displacement that noise alone makes
-constexpr double kHardBlur = 0.35;         // pixels: sharper edges were drawn to whole pixels
-constexpr double kSameLevel = 0.2;         // of the contrast: the ground is as bright as the card
-constexpr double kMinCard = 1.1;           // outer diameters: least diameter of a card whose edge shows
-constexpr double kProcessing = 0.5;        // share of a misfit that may be common to a whole edge
-constexpr double kMaxProcessing = 0.1;     // of the contrast: residuals that processing may make
-constexpr double kClippedEdge = 0.4;       // blurs by which the edge of clipped paper may be displaced
+constexpr double kMisfit = 0.045;         // of the contrast: RMS residual on the ring's edges
+constexpr double kRaggedMisfit = 0.062;   // the same for smoothed edges
+constexpr double kMinRagged = 16;         // pixels: smaller ragged rings may be letters
+constexpr double kMaxGrowth = 2.5;        // factor of the misfit allowed for the largest roundels, and
+constexpr double kMaxRaggedGrowth = 1.5;  // for smoothed ones
+constexpr double kMaxOffset = 0.15;       // pixels: RMS displacement of an edge around its ellipse
+constexpr double kChance = 2;             // times the displacement that noise alone makes
+constexpr double kHardBlur = 0.35;        // pixels: sharper edges were drawn to whole pixels
+constexpr double kSameLevel = 0.2;        // of the contrast: the ground is as bright as the card
+constexpr double kMinCard = 1.1;          // outer diameters: least diameter of a card whose edge shows
+constexpr double kProcessing = 0.5;       // share of a misfit that may be common to a whole edge
+constexpr double kMaxProcessing = 0.1;    // of the contrast: residuals that processing may make
+constexpr double kClippedEdge = 0.4;      // blurs by which the edge of clipped paper may be displaced
 // A ring of fewer pixels than this shows the product of its width and its contrast, whose factors hardly
 // differ from those of a thinner and darker ring: its ink must be black.
 constexpr double kThinRing = 3.6;
@@ -70,8 +69,7 @@ bool has_elliptic_edges(const EdgeMisfit& misfit, const RoundelFit& fit, double 
     const auto is_small = [&](const Displacement& edge, double r) {
         // Rounding to whole pixels: a sixth of the turn has about r pixels.
         const double drawn = fit.blur < kHardBlur ? std::sqrt(1 / (12 * r)) : 0;
-        return edge.rms <
-               std::hypot(kChance * edge.chance, kChance * drawn, std::min(kMaxOffsetRadius * r, most));
+        return edge.rms < std::hypot(kChance * edge.chance, kChance * drawn, most);
     };
     return is_small(outer, radius) && is_small(inner, fit.ratio * radius);
 }

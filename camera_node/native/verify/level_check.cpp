@@ -34,8 +34,11 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
 
 /// Spread of a further ring's distance, in radii of the first one, from direction to direction.
 constexpr float kMaxSpread = 1.3f;
+// Least contrast of a further ring: blur makes thin rings, and paper between them, grey.
+constexpr double kRingDepths[] = {0.3, 0.5};
 
-bool is_bullseye(const ImageView& image, const RoundelFit& fit, double depth) {
+/// Whether rings that are darker than paper by `depth` of the contrast surround this one.
+static bool has_rings_around(const ImageView& image, const RoundelFit& fit, double depth) {
     const float theta = float(fit.bright - depth * fit.contrast());
     const int below = int(std::ceil(theta));
     const Ellipse& e = fit.outer;
@@ -56,6 +59,11 @@ bool is_bullseye(const ImageView& image, const RoundelFit& fit, double depth) {
         if (most >= kMaxSpread * least) return false;
     }
     return true;
+}
+
+bool is_bullseye(const ImageView& image, const RoundelFit& fit, bool known) {
+    return has_rings_around(image, fit, kRingDepths[0]) ||
+           (!known && has_rings_around(image, fit, kRingDepths[1]));
 }
 
 }  // namespace roundel

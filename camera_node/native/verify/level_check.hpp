@@ -14,7 +14,9 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit);
 
 /// Whether at least two more dark rings surround a ring within four of its diameters: then it is a bullseye.
 /// A single one may be a plate below the card, or the line along which the card was cut.
-/// A ring counts if it is darker than paper by `depth` of the contrast.
-bool is_bullseye(const ImageView& image, const RoundelFit& fit, double depth);
+///
+/// A ring of no `known` print is more often one of a bullseye, so two least contrasts of the further rings
+/// are tried for it.
+bool is_bullseye(const ImageView& image, const RoundelFit& fit, bool known);
 
 }  // namespace roundel
