@@ -59,7 +59,7 @@ def test_a_camera_with_few_detections_is_excluded_and_named():
     assert squared < chi2.ppf(0.999, degrees)
 
 
-@pytest.mark.parametrize("cameras", [3, 5])
+@pytest.mark.parametrize("cameras", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_light_with_persistent_reflections(cameras: int):
     """A tenth of the frames shows a reflection of the light, for half a second each, and each camera has long gaps.
     Distances between cameras, up to scale, are right to 0.2 %: the lenses state no standard deviations, and three
@@ -84,7 +84,7 @@ def test_a_light_with_persistent_reflections(cameras: int):
     assert gaps[0] / gaps[0].max() == pytest.approx(gaps[1] / gaps[1].max(), abs=2e-3)
 
 
-@pytest.mark.parametrize("rate_hz", [5, 30])
+@pytest.mark.parametrize("rate_hz", [pytest.param(5, marks=pytest.mark.slow), 30])
 def test_webcams_with_rolling_shutter(rate_hz: float):
     """Clock offsets of 300 ms and 200 ppm, timestamp jitter, a readout time of 15 ms, and dropped frames. The rolling
     shutter is not modelled: half of its readout time at half a metre per second is 4 mm, the limit."""

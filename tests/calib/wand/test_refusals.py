@@ -69,7 +69,7 @@ def test_a_camera_that_is_not_placed_has_a_reason(change: Change, reason: str):
     assert list(result.rig.placed()) == ["cam0", "cam1", "cam2"]
 
 
-@pytest.mark.parametrize("sigma_px", [0.1, 0.4])
+@pytest.mark.parametrize("sigma_px", [pytest.param(0.1, marks=pytest.mark.slow), 0.4])
 @pytest.mark.parametrize("wrong", [(0.2, 0.55), (0.3, 0.55), (0.19, 0.55)])
 def test_a_wand_with_other_lengths_than_its_file_is_measured(wrong: tuple[float, float], sigma_px: float):
     """The ratio is known from single images; a wand of the ratio that the error states is calibrated."""

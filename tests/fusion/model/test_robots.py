@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Symmetric constellations and robots that look alike are refused with a reason."""
 
-import time
-
 import msgspec
 import numpy as np
 import pytest
@@ -151,26 +149,11 @@ def test_normals_are_scaled_and_saved_as_they_were(tmp_path):
 
 
 def test_more_robots_than_can_be_tracked_are_refused_before_the_work():
-    """Before: 3,000 robots took 14 s, in a request on the server's thread."""
-    many = {f"r{k}": Robot(diameter_m=0.05, start_m=(float(k), 0.0, 0.0)) for k in range(3000)}
-    begun = time.process_time()
+    """Comparing 3,000 of them took 14 s, so that comparing these would outlast the time limit of a test."""
+    many = {f"r{k}": Robot(diameter_m=0.05, start_m=(float(k), 0.0, 0.0)) for k in range(20_000)}
     for check in (lambda: require_trackable(many, "robots.yaml"), lambda: changed({}, {}, (), many)):
-        with pytest.raises(ConfigError, match=f"3000 robots .* at most {MAX_ROBOTS} robots"):
+        with pytest.raises(ConfigError, match=f"20000 robots .* at most {MAX_ROBOTS} robots"):
             check()
-    assert time.process_time() - begun < 1.0
-
-
-def test_the_comparison_of_seven_markers_is_fast():
-    """Before: 17 ms a pair, 5,040 labelings of which few begin with equal distances."""
-    rng = np.random.default_rng(3)
-    shape = np.column_stack([rng.permuted(np.linspace(-0.4, 0.4, 7)), np.linspace(-0.4, 0.4, 7), np.zeros(7)])
-    robots = {
-        f"r{k}": Robot(diameter_m=0.04, markers=tuple(map(tuple, ((1 + 0.1 * k) * shape).tolist())))
-        for k in range(25)
-    }
-    begun = time.process_time()
-    require_distinct(robots)
-    assert time.process_time() - begun < 2.0  # 0.1 s; it was 5 s
 
 
 @pytest.mark.parametrize("sizes", [(3, 3), (4, 4), (3, 5)])

@@ -4,31 +4,26 @@
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 import zenoh
 
-from calib.live.rig_requests import set_rig
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.foundation.config import dump_yaml
-from camera_node.protocol.messages import Detections, decode, encode
+from camera_node.protocol.messages import Detections, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
-from fusion.protocol.pose_messages import FusedFrames, frames_key
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.arena_queries import RIG_ANSWERS_HZ
 from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import ROOT, free_port
 from tests.fusion.serving import ARENA, KEYS, config, serving, serving_process
-from tests.fusion.unknown_robot import serving_an_unknown_robot
 from tests.processes import run_program
-from tests.waiting import DEADLINE_S, wait_for
+from tests.waiting import DEADLINE_S
 
 OTHER = Rig(
     cameras={
@@ -165,28 +160,3 @@ def test_a_client_that_asks_often_always_gets_the_rig(tmp_path: Path):
     with serving(config(tmp_path)) as (_, client):
         rigs = [client.rig() for _ in range(round(2 * RIG_ANSWERS_HZ))]
     assert all(rig is not None and rig.cameras == ARENA.cameras for rig in rigs)
-
-
-def test_a_rig_with_new_lenses_costs_no_frame_set(tmp_path: Path):
-    """Before: their tables were made on the server's thread, and frame sets began again. The request takes as long as
-    the tables; in that time frame sets follow one another, and none waits for all of them."""
-    fused: list[tuple[float, int]] = []
-    spare = msgspec.structs.replace(
-        ARENA.cameras["cam0"], width=4000, height=3000, fx=2000.0, cx=2000.0, cy=1500.0
-    )
-    spares = {f"spare{k}": msgspec.structs.replace(spare, fy=2001.0 + k) for k in range(3)}
-
-    def note(sample: zenoh.Sample) -> None:
-        fused.append((time.monotonic(), decode(sample.payload.to_bytes(), FusedFrames).t_ns))
-
-    with serving_an_unknown_robot(tmp_path) as (_, client):
-        client.session.declare_subscriber(frames_key("test"), note)
-        wait_for(lambda: len(fused) > 10)
-        begun_s, n = time.monotonic(), len(fused)
-        set_rig(client.session, "test", Rig(cameras={**ARENA.cameras, **spares}), "test")
-        request_s, after = time.monotonic() - begun_s, len(fused)
-        wait_for(lambda: len(fused) > after + 10)
-    arrivals, times = np.array(fused[n - 1 :]).T
-    steps = np.diff(times.astype(np.int64))
-    assert steps.max() < 1.5 * np.median(steps)
-    assert np.diff(arrivals).max() < request_s / 2

@@ -46,7 +46,11 @@ def placed(seed: int, off: tuple[float, float, float], with_sigma: bool) -> Wand
 
 
 @pytest.mark.parametrize(
-    ("off", "with_sigma"), [(CAREFUL, True), pytest.param(OLD, False, marks=pytest.mark.slow), (SHEET, False)]
+    ("off", "with_sigma"),
+    [
+        *(pytest.param(*row, marks=pytest.mark.slow) for row in ((CAREFUL, True), (OLD, False))),
+        (SHEET, False),
+    ],
 )
 def test_covariances_of_rigs_from_inaccurate_lenses_are_right(
     off: tuple[float, float, float], with_sigma: bool
@@ -99,7 +103,7 @@ def test_standard_deviations_that_the_recording_contradicts_do_not_count():
     assert np.delete(sigma, 2) == pytest.approx(CAREFUL[0], rel=0.05)  # times f as it is off
 
 
-@pytest.mark.parametrize("off", [OLD, SHEET])
+@pytest.mark.parametrize("off", [OLD, pytest.param(SHEET, marks=pytest.mark.slow)])
 def test_the_covariance_of_one_recalibrated_camera_with_an_inaccurate_lens_is_right(
     off: tuple[float, float, float],
 ):

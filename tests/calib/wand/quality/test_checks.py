@@ -34,7 +34,7 @@ def test_a_wand_file_with_a_wrong_spacing_is_refused():
         calibrate(arena.intrinsics, far_off, messages)
 
 
-@pytest.mark.parametrize("sigma_px", [0.1, 0.4])
+@pytest.mark.parametrize("sigma_px", [pytest.param(0.1, marks=pytest.mark.slow), 0.4])
 def test_a_length_of_6_percent_too_much_is_refused_by_the_sizes(sigma_px: float):
     """0.53 m for 0.50: two markers have no ratio, but their sizes have. The stated diameter reconciles both, and the
     true length too."""

@@ -48,8 +48,8 @@ def test_the_reason_of_a_camera_that_is_left_out_names_its_clock():
     assert len(result.names) == 5
 
 
-@pytest.mark.parametrize("rough", [False, True])
-@pytest.mark.parametrize("drift_ppm", [50.0, 800.0])
+@pytest.mark.parametrize("rough", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("drift_ppm", [pytest.param(50.0, marks=pytest.mark.slow), 800.0])
 def test_ordinary_clocks_do_not_jump(drift_ppm: float, rough: bool):
     """Neither free-running crystals nor clocks that a time service slews, with good and with inaccurate lenses."""
     scenario = WandScenario(cameras=5, seconds=20, rate_hz=30, drift_ppm=drift_ppm, seed=2)

@@ -46,7 +46,7 @@ def test_a_lens_of_another_shape_is_adjusted_and_named(index: int, by: float, nu
     assert f", {named} " in change.sentence()
 
 
-@pytest.mark.parametrize("factor", [0.85, 1.1, 1.2])
+@pytest.mark.parametrize("factor", [0.85, pytest.param(1.1, marks=pytest.mark.slow), 1.2])
 def test_a_lens_known_from_a_data_sheet_or_another_camera_is_adjusted(factor: float):
     """Focal lengths of data sheets are 9 % off and more. The camera stays, with its focal length right to 4 sigmas."""
     rig = recorded(1).intrinsics
