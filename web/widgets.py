@@ -104,8 +104,11 @@ class ActionButton:
         self.handle.on_click(lambda event: self.run(event.client))
 
     def run(self, client: viser.ClientHandle | None = None) -> None:
-        """Run the action for a browser, unless it runs already or can not act."""
-        if not self._enabled or not self._running.acquire(blocking=False):
+        """Run the action for a browser, unless it runs already.
+
+        Also while the button is disabled, which its browser may not show yet: each action says why it can't act.
+        """
+        if not self._running.acquire(blocking=False):
             return
         self.client = client
         self._show_disabled()
@@ -193,6 +196,8 @@ class UndoButton(ActionButton):
         self.show(enabled=bool(self._changes), label=self._label + last)
 
     def _undo(self) -> str:
+        if not self._changes:
+            raise WebError("there is nothing to undo here")
         about, revert = self._changes.pop()
         revert()
         return f"undone: {about}"

@@ -13,6 +13,7 @@ import pytest
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
 from tests.conftest import free_port
+from tests.waiting import DEADLINE_S
 from web.page_access import PageAccess
 from web.state.feed import Feed
 from web.view import PanelSection, View
@@ -95,7 +96,7 @@ def browsing(view: View, url: str = "") -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 1000, "height": 700})
-        page.set_default_timeout(50e3)
+        page.set_default_timeout(1e3 * DEADLINE_S)
         page.on("console", record)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(url or view.access.address)

@@ -14,7 +14,7 @@ from tests.web.browser import loopback
 from web.errors import WebError
 from web.state.feed import ArenaState, Feed
 from web.view import View
-from web.widgets import Answer, ConfirmedButton, Decision, set_property
+from web.widgets import ActionButton, Answer, ConfirmedButton, Decision, set_property
 
 
 @pytest.fixture
@@ -112,3 +112,17 @@ def test_a_decision_is_made_once(gui: viser.GuiApi):
     with pytest.raises(WebError, match="nothing to accept as the lens: it was decided, or not made yet"):
         decision.accept()
     assert used == ["north"]
+
+
+def test_a_click_is_answered_though_the_button_was_just_disabled(gui: viser.GuiApi):
+    """The browser showed it enabled: what makes it act may come and go with each message."""
+    done: list[str] = []
+
+    def act() -> str:
+        done.append("done")
+        return "done"
+
+    button = ActionButton(gui, "Define", act, Answer(gui))
+    button.show(enabled=False)
+    button.run()
+    assert (done, button.handle.disabled) == (["done"], True)

@@ -83,6 +83,8 @@ class RobotEditor:
 
     def delete_all(self) -> str:
         """Remove the selected robots."""
+        if not self._selection.names:
+            raise FusionError("no robot is selected; click names above")
         return self._remove(self._selection.names)
 
     def move_pivot(self) -> str:
