@@ -8,14 +8,12 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMisfit = 0.03;     // of the contrast: RMS residual on the ring's edges
-constexpr double kMinSupport = 0.7;  // share of the pixels on the path that are in the image
-constexpr double kMaxMotion = 1.2;   // major axes
+constexpr double kMisfit = 0.03;    // of the contrast: RMS residual on the ring's edges
+constexpr double kMaxMotion = 1.2;  // major axes
 // Standard deviation of the centre, minor axes. Models of clutter are blurred or long until few pixels
 // determine them: 0.010 to 0.030, and roundels 0.003 at most.
 constexpr double kMaxSigma = 0.05;      // of a roundel of the last frame
 constexpr double kMaxNewSigma = 0.008;  // of a new one
-constexpr double kMaxChange = 1.3;      // factor by which contrast and axes differ from the last frame's
 constexpr double kMinMinor = 12;        // pixels: smaller ones cannot be distinguished from clutter
 constexpr double kReach = 0.75;         // minor axes searched around the predicted position, plus
 constexpr double kReachPerSpeed = 0.5;  // so many frames of motion,
@@ -25,17 +23,8 @@ constexpr double kMaxReach = 2.5;       // at most so many minor axes
 bool is_accepted(const RoundelFit& fit, const AcceptanceContext& context, double noise, double max_sigma) {
     const Symmetric centre = fit.centre_covariance();
     return is_within_limits(fit, context.limits) && fit.is_explained(noise, kMisfit) &&
-           fit.support > kMinSupport &&
            std::hypot(fit.motion_x, fit.motion_y) < kMaxMotion * fit.outer.major &&
            std::sqrt(centre.xx + centre.yy) < max_sigma * fit.outer.minor;
-}
-
-bool is_similar(double value, double last) { return value < kMaxChange * last && last < kMaxChange * value; }
-
-/// From frame to frame neither the levels nor the view change much.
-bool is_similar(const RoundelFit& fit, const RoundelFit& last) {
-    return is_similar(fit.contrast(), last.contrast()) && is_similar(fit.outer.major, last.outer.major) &&
-           is_similar(fit.outer.minor, last.outer.minor);
 }
 
 }  // namespace
@@ -53,8 +42,7 @@ std::optional<RoundelFit> fit_known_moving(const ImageView& image, const KnownRo
         std::max(context.noise, context.camera.edge_noise());  // with what processing leaves at edges
     const auto fit_from = [&](const MovingGuess& guess) {
         const auto fit = fit_moving(image, guess);
-        return fit && is_accepted(*fit, context, noise, kMaxSigma) && is_similar(*fit, last) ? fit
-                                                                                             : std::nullopt;
+        return fit && is_accepted(*fit, context, noise, kMaxSigma) ? fit : std::nullopt;
     };
     MovingGuess predicted{{last.outer, last.ratio, last.dark, last.bright}, last.motion_x, last.motion_y};
     predicted.still.outer.x += known.vx;

@@ -22,16 +22,19 @@ constexpr double kOcclusion = 0.06;    // of sectors that show an occlusion alth
 // Of masked sectors, in turn: a biased fit spreads its misfit.
 constexpr double kSlacks[] = {0.48, 0.12, 0.03};
 
-constexpr int kMaxMasked = 26;           // sectors of 32, of one edge
-constexpr int kMaxMaskedOfBoth = 44;     // sectors of 64, of both edges
-constexpr double kMaxRatioError = 0.01;  // from the nearest print, beside its uncertainty: shows a bias
-constexpr double kMaxTone = 1.2;         // curvature of a tone curve that is not known: twice its spread
-constexpr double kMinNew = 16;           // pixels: smaller new ones contain too little information
+constexpr int kMaxMasked = 26;            // sectors of 32, of one edge
+constexpr int kMaxMaskedOfBoth = 44;      // sectors of 64, of both edges
+constexpr double kMaxRatioError = 0.01;   // from the nearest print, beside its uncertainty: shows a bias
+constexpr double kMaxRatioSigma = 0.005;  // of that uncertainty
+constexpr double kMaxTone = 1.2;          // curvature of a tone curve that is not known: twice its spread
+constexpr double kMinNew = 16;            // pixels: smaller new ones contain too little information
 
 // Levels in units of the contrast, from ink (0) to paper (1):
 constexpr double kForeign = 0.05;       // difference of a level that is neither of them
 constexpr double kForeignSigmas = 3.5;  // the same in standard deviations
 constexpr double kThinInk = 0.12;       // of a thin stroke
+constexpr double kBright = 0.3;         // of a place in the ring without ink, allowed
+constexpr int kMaxBright = 2;           // in so many unmasked sectors
 constexpr double kNotPaper = 0.3;       // difference from paper
 
 constexpr double kRim = 1.06;  // outer radii: ink there continues the ring
@@ -99,6 +102,11 @@ bool has_round_card(const SectorView& view) {
 /// just outside of the ring where the ring is complete.
 bool is_letter(const SectorView& view, const RoundelFit& fit, const OcclusionMask& mask, double noise) {
     const Sectors masked = mask.outer | mask.inner, foreign = find_foreign(view, fit, noise);
+    Sectors bright = 0;
+    for (const double share : {0.25, 0.5, 0.75})
+        bright |=
+            view.find(fit.ratio + share * (1 - fit.ratio), [](double level) { return level > kBright; });
+    if (count_sectors(bright & ~masked) > kMaxBright) return true;
     Sectors inked = 0;
     for (const double radius : {0.8 * fit.ratio, kRim, 1.12, 1.2})
         inked |= view.find(radius, [](double level) { return std::abs(level) < kThinInk; });
@@ -125,8 +133,9 @@ bool hides_inner_edge_only(const OcclusionMask& mask) {
 /// Whether the ratio is that of a print. Of a new roundel nothing else is known in advance. An occlusion that
 /// the residuals do not show biases the ratio as well as the position.
 bool has_print_ratio(const RoundelFit& fit, std::span<const Print> prints, double slack) {
-    return prints.empty() || std::abs(nearest_print(prints, fit.ratio).ratio - fit.ratio) <
-                                 std::hypot(kMaxRatioError, 2 * fit.ratio_sigma, slack);
+    return prints.empty() ||
+           std::abs(nearest_print(prints, fit.ratio).ratio - fit.ratio) <
+               std::hypot(kMaxRatioError, 2 * std::min(fit.ratio_sigma, kMaxRatioSigma), slack);
 }
 
 }  // namespace
