@@ -13,11 +13,12 @@ from calib.commands.inputs import read_recording, require_one, require_positive,
 from calib.commands.output import check_folder, conclude, provenance, write_rig
 from calib.errors import CalibrationError
 from calib.live.collect import collect_with_progress
+from calib.rig.camera import span_dimension
 from calib.rig.rig import Rig, load_rig
 from calib.world.landmarks import FRAME, SURVEY, WAND, align_to_roundels, name_markers, read_positions
 from calib.world.resection import place_by_points
 from calib.world.still_roundels import find_still_roundels
-from calib.world.world_frame import align_cameras, check_above, is_collinear
+from calib.world.world_frame import align_cameras, check_above
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import ConfigError
@@ -146,11 +147,11 @@ def _move_by_cameras(rig: Rig, file: Path) -> tuple[Rig, dict[str, float]]:
 def _check_landmarks(landmarks: Landmarks, file: Path, on_line: bool) -> None:
     """Raise CalibrationError for landmarks that can't fix a world, before any work is done."""
     points = np.array(list(landmarks.values())).reshape(-1, 3)
-    if on_line and (len(points) < 2 or not is_collinear(points)):
+    if on_line and (len(points) < 2 or span_dimension(points) != 1):
         raise CalibrationError(f"{file} is not a straight wand with two or more roundels; give it as --frame")
     if not on_line and len(points) < 3:
         raise CalibrationError(f"{file} has {len(points)} points; a world needs three or more")
-    if not on_line and is_collinear(points):
+    if not on_line and span_dimension(points) < 2:
         raise CalibrationError(
             f"the points in {file} lie on a line, which leaves the rotation about it open; move a roundel away from "
             "that line, or stand a straight wand upright and give it as --standing"

@@ -9,6 +9,7 @@ from rich.table import Table
 
 from calib.commands.output import save_image
 from calib.intrinsics.residual_plot import draw_residuals
+from calib.rig.estimation import CLEAR
 from calib.rig.precision_map import draw_precision
 from calib.wand.quality.grade import RigQuality
 from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
@@ -17,7 +18,6 @@ from calib.wand.wand_report import WandCalibration, WandReport
 from camera_node.foundation.terminal import console, say
 
 MIN_INFLATION = 1.2  # of standard deviations, that is printed
-CLEAR = 3.0  # standard deviations, from which a clock drift is printed
 MAX_READOUT_SIGMA_MS = (
     2.0  # of a readout time that counts as determined: 1 mm at the edge of the image at 1 m/s
 )

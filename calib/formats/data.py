@@ -15,6 +15,7 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
+from calib.rig.estimation import STEPS
 from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.config import write_atomically
@@ -24,7 +25,6 @@ from camera_node.geometry.pose import Pose, invert, rotation_from_vector, skew
 
 MAX_FILE_BYTES = 1 << 28  # of a table of points: an hour of 16 cameras at 60 Hz takes a fifth of it
 GRID = 25  # points across and down the image
-STEPS = 10
 MAX_OFF_PX = 1.0  # a lens that differs more is another lens
 
 

@@ -12,14 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_cost, cauchy_weights, coordinate_sigma
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector
 
-CAUCHY = 2.3849  # scale of the Cauchy loss, in standard deviations: 95 % efficient on normal residuals
 MAX_ITERATIONS = 100
 MAX_DAMPING = 1e10
-POSE_STEPS = 5
 # The prior of a lens, 1 sigma; it matters only where the views leave a parameter open.
 CORNER_SIGMA_PX = 0.2  # of a detected corner: the weight of views against the prior
 TERM_SIGMA = 0.2  # of each radial distortion term at the image's corner, as a fraction of the corner's radius
@@ -117,7 +116,8 @@ def adjust_lens(
     state, prior = _State(lens, _locate_all(lens, views)), LensPrior.of(lens, aspect_sigma)
     damping, residuals = 1e-3, _residuals(state, views)
     for _ in range(MAX_ITERATIONS):
-        scale = CAUCHY * _robust_sigma(residuals) if robust else np.inf
+        distances = np.linalg.norm(np.concatenate(residuals), axis=1)
+        scale = CAUCHY_SCALE * max(coordinate_sigma(distances), 1e-6) if robust else np.inf
         normal = _linearize(state, views, prior, scale)
         before = after = _cost(residuals, scale) + prior.cost(state.lens)
         while damping < MAX_DAMPING:
@@ -139,7 +139,7 @@ def held_out_rms(lens: Lens, views: Sequence[BoardView]) -> float:
         return float("inf")
     state, prior = _State(lens, _locate_all(lens, known)), LensPrior.of(lens, ANY_SIGMA)
     still = np.zeros(len(lens.parameters))
-    for _ in range(POSE_STEPS):
+    for _ in range(STEPS):
         normal = _linearize(state, known, prior, np.inf)
         steps = np.linalg.solve(normal.H_vv, normal.g_v[:, :, None])[:, :, 0]
         state = state.moved(still, np.asarray(steps, float))
@@ -239,7 +239,7 @@ def _linearize(state: _State, views: Sequence[BoardView], prior: LensPrior, scal
         # dp = w x (R X) + t for a rotation w about the board's origin and a translation t.
         J_v = np.concatenate([np.cross(rotated[:, None, :], J_point), J_point], axis=2)
         r = view.pixels - uv
-        w = 1 / (1 + (np.linalg.norm(r, axis=1) / scale) ** 2)
+        w = cauchy_weights(np.linalg.norm(r, axis=1), scale)
         wJ_l, wJ_v = w[:, None, None] * J_l, w[:, None, None] * J_v
         H_ll = H_ll + np.einsum("nij,nik->jk", wJ_l, J_l)
         g_l = g_l + np.einsum("nij,ni->j", wJ_l, r)
@@ -260,12 +260,7 @@ def _residuals(state: _State, views: Sequence[BoardView]) -> list[Array]:
 def _cost(residuals: Sequence[Array], scale: float) -> float:
     """Sum over all corners, square pixels; NaN, which is never below another cost, with a corner behind the camera."""
     squares = np.concatenate([(r**2).sum(axis=1) for r in residuals])
-    return float(squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum())
-
-
-def _robust_sigma(residuals: Sequence[Array]) -> float:
-    """Standard deviation of one coordinate, pixels: the median of a Rayleigh distribution is 1.1774 sigma."""
-    return max(float(np.median(np.linalg.norm(np.concatenate(residuals), axis=1))) / 1.1774, 1e-6)
+    return cauchy_cost(squares, scale)
 
 
 def _covariance(state: _State, views: Sequence[BoardView], prior: LensPrior, residuals: list[Array]) -> Array:

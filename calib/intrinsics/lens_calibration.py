@@ -22,6 +22,7 @@ from calib.intrinsics.lens_adjustment import (
 )
 from calib.rig.camera import Camera, stated_sigma
 from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_of
+from calib.rig.estimation import CLEAR
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
@@ -38,7 +39,6 @@ MIN_TILT_DEG = 10.0  # between views: parallel views leave the focal length open
 MAX_SIGMA = (
     0.005  # median projection uncertainty, as a fraction of the longer side: beyond, a lens is useless
 )
-NOT_SQUARE = 3.0  # standard deviations of fx / fy from 1, from which pixels are not square
 CLEARLY_BETTER = 0.8  # ratio of held-out residuals, below which the other lens model is suggested
 MAX_EXAMINED = 6  # images without a board, in which a mirrored one is looked for
 MAX_VIEW_RMS = 3.0  # of a view, in medians over views: beyond, it is an outlier (motion blur, a bent board)
@@ -101,7 +101,7 @@ class CalibratedLens:
                 f"the lens has no inverse in the {enumerate_words(corners)} corner; show the board there"
             )
         ratio, sigma = aspect_ratio(self.adjusted)
-        if abs(ratio - 1) > max(CLEARLY_NOT_SQUARE, 3 * sigma):
+        if abs(ratio - 1) > max(CLEARLY_NOT_SQUARE, CLEAR * sigma):
             warnings.append(
                 f"its pixels are not square: fx / fy = {ratio:.4f} +- {sigma:.4f}; check that the driver does not "
                 "scale the image"
@@ -337,7 +337,7 @@ def _free_aspect(adjusted: AdjustedLens, views: Sequence[BoardView]) -> Adjusted
     """The lens adjusted without the prior of square pixels, where the views show that they are not square."""
     free = adjust_lens(adjusted.lens, views, aspect_sigma=ANY_SIGMA)
     ratio, sigma = aspect_ratio(free)
-    return free if abs(ratio - 1) > NOT_SQUARE * sigma else adjusted
+    return free if abs(ratio - 1) > CLEAR * sigma else adjusted
 
 
 def _check_lens(adjusted: AdjustedLens, coverage: Coverage, sigma_px: Array) -> None:

@@ -23,6 +23,8 @@ PER_CAMERA = 18
 # principal point, and distortion coefficients (k1, k2, p1, p2, k3 of a pinhole lens).
 FOCAL_STABILITY, CENTRE_STABILITY, DISTORTION_STABILITY = 5e-4, 0.3, (5e-4, 2e-4, 2e-5, 2e-5, 2e-4)
 
+FLAT = 0.01  # of the extent of points: those nearer to a line or a plane lie on it
+
 
 class Camera(Lens, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """A lens with its pose in the world and the offset of its clock.
@@ -102,6 +104,13 @@ def stated_sigma(lens: Lens, sigma: Sequence[float]) -> tuple[float, ...]:
     rest = (*DISTORTION_STABILITY, *[0.0] * len(sigma))
     stability = (FOCAL_STABILITY * lens.fx, FOCAL_STABILITY * lens.fy, *[CENTRE_STABILITY] * 2, *rest)
     return tuple(float(max(pair)) for pair in zip(sigma, stability, strict=False))
+
+
+def span_dimension(points: Array) -> int:
+    """The dimension of the span of points (n, 3), to a hundredth of its extent: 0 of points that coincide, 1 of a line,
+    2 of a plane."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return int((spread > max(FLAT * spread[0], 1e-6)).sum())
 
 
 def transform(T: Array, points: ArrayLike) -> Array:

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig.estimation import CHANCE, GROSS
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.problem import SLEWED_DRIFT
 from calib.wand.detections import FrameTable, MarkerTrack, Timing, WandDetections, gather
@@ -26,9 +27,7 @@ from camera_node.protocol.messages import Detections
 
 GRID_S = 1 / 30  # between samples
 STEP_S = 0.1  # over which velocities are averaged: a hand moves below 2 Hz
-GROSS = 5.0  # times the median: larger velocities are outliers
 MAX_RATE = 0.03  # by which two clocks may differ: 29.97 frames a second read as 30 or 29, 24 as 25 is beyond
-CHANCE = 1e-4  # probability of a false alignment, over all shifts and rates
 MAX_TRACKS = 8  # markers of which each camera's velocity is used
 OTHERS, MISFIT = 40, 0.25  # shifts that are compared, and the misfit at the right one over the least of these
 FEW = 8.0  # independent samples, which a correlation of two by two coordinates needs

@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from calib.rig.camera import transform
+from calib.rig.camera import FLAT, span_dimension, transform
+from calib.rig.estimation import MARGIN, STEPS
 from calib.wand.detections import MarkerTrack, WandDetections
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
@@ -27,12 +28,9 @@ from camera_node.geometry.pose import invert, rotation_from_vector, skew
 
 MIN_MARKERS = 4  # of a view, that give the body's pose
 MAX_VIEW = 32  # of a view, that are used to locate it
-FLAT = 0.01  # of the extent of points: those nearer to a line or a plane lie on it
 SIGMA_RAD = 1.5e-3  # of a ray to a marker by a rough rig: 3 px of a lens of 2000 px
 GATE_RAD = 5 * SIGMA_RAD  # a ray farther from its marker is an outlier
-# Least difference of the squared Mahalanobis distances of two solutions, one of which is chosen.
-MARGIN = 12.0
-ITERATIONS, TOLERANCE = 10, 0.01  # of Gauss-Newton, and the least gain of its cost
+TOLERANCE = 0.01  # the least gain of the cost in a step
 BEHIND = 1e-3  # m: a marker nearer to the camera, or behind it, counts as this far
 SWEEPS = 3  # in which all cameras are located in turn by the body
 FRAMES = 200  # of a camera, that place it
@@ -77,23 +75,21 @@ class PlacedCamera:
 
 def has_poses(wand: Body) -> bool:
     """Whether the markers give the pose of the body: four or more that are not on a line."""
-    return len(wand.markers) >= MIN_MARKERS and _rank(wand.points) >= 2
-
-
-def _rank(points: Array) -> int:
-    """The dimension of the span of points (n, 3): 1 of a line, 2 of a plane."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return int((spread > FLAT * max(spread[0], 1e-12)).sum())
+    return len(wand.markers) >= MIN_MARKERS and span_dimension(wand.points) >= 2
 
 
 def solve_view(points: Array, xy: Array) -> list[Array]:
     """Poses (4, 4) of a body in a camera, the better one first, from image plane coordinates (n, 2) of its points
     (n, 3); none where they do not determine it."""
-    if len(points) < MIN_MARKERS or (rank := _rank(points)) < 2:
+    if len(points) < MIN_MARKERS or (rank := span_dimension(points)) < 2:
         return []
-    method = cv2.SOLVEPNP_IPPE if rank == 2 else cv2.SOLVEPNP_SQPNP
+    method, given = cv2.SOLVEPNP_SQPNP, points
+    if rank == 2:  # IPPE needs points that are exactly in a plane
+        off = points - points.mean(axis=0)
+        normal = np.linalg.svd(off)[2][2]
+        method, given = cv2.SOLVEPNP_IPPE, points - np.outer(off @ normal, normal)
     try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(points, xy, np.eye(3), None, flags=method)
+        _, turns, shifts, _ = cv2.solvePnPGeneric(given, xy, np.eye(3), None, flags=method)
     except cv2.error:
         return []
     found = []
@@ -219,7 +215,7 @@ class BodyLocator:
     def _refine(self, poses: Array, views: _Views, owner: Index) -> tuple[Array, Array]:
         """Poses (P, 4, 4) adjusted to their images by reweighted Gauss-Newton, and their costs (P,)."""
         best, least = poses, self._costs(poses, views, owner)
-        for _ in range(ITERATIONS):
+        for _ in range(STEPS):
             residuals, J = self._residuals(best, views, owner)
             weight = 1 / (1 + (np.linalg.norm(residuals, axis=1) / SIGMA_RAD) ** 2 / 2)
             first = np.searchsorted(owner, np.arange(len(best)))
@@ -397,7 +393,7 @@ def _place(
             "no other camera that is placed saw four markers of the wand when it did; show them the wand at once, each "
             "any side of the wand"
         )
-    if len(images.points) < MIN_MARKERS or _rank(images.points) < 2:
+    if len(images.points) < MIN_MARKERS or span_dimension(images.points) < 2:
         return (
             "it saw too few markers with the others to be placed; show it any side of the wand in more frames"
         )
@@ -476,7 +472,7 @@ def _refine_camera(images: _Images, T: Array, sigma: float) -> Array | None:
     """The pose adjusted to the images near its own; None where these are too few."""
     for _ in range(SWEEPS):
         inlier = images.choose(T, sigma)[1] & (images.errors(T) < GATE_RAD)
-        if inlier.sum() < MIN_MARKERS or _rank(images.points[inlier]) < 2:
+        if inlier.sum() < MIN_MARKERS or span_dimension(images.points[inlier]) < 2:
             return None
         turn, shift = cv2.solvePnPRefineLM(
             images.points[inlier],

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT
+from calib.rig.estimation import CHANCE, CLEAR
 from calib.wand.bundle_adjustment.covariance import (
     camera_covariance,
     inflate_covariance,
@@ -39,14 +40,12 @@ from calib.wand.wand_report import ClockJump
 from camera_node.foundation.arrays import Array
 
 MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
-POSSIBLE = 3.0  # standard deviations by which a readout time may exceed the time between two frames
 # A jump that does not disturb the rig leaves neither: the rejected share of a camera's observations, and its drift,
 # s/s.
 MAX_REJECTED, MAX_DRIFT = 0.1, 5 * CRYSTAL_DRIFT
 SHIFT_SIZES = np.geomspace(1e-3, 0.4, 24)
 SHIFTS = np.concatenate([-SHIFT_SIZES[::-1], [0.0], SHIFT_SIZES])  # seconds, that are tried
 MAX_DEVIATION = 100.0  # sigmas: larger ones count as this
-CHANCE = 1e-4  # probability of a false jump, over all cameras and times
 AGREEMENT = 2.0  # factor within which the shift and the adjustment must agree on the jump
 MIN_FRAMES = 10  # of the camera on either side of the jump: fewer do not determine its pose
 
@@ -127,7 +126,7 @@ def _has_readout(readout_s: Array, adjusted: Adjusted, timing: Timing) -> bool:
     cameras = list(adjusted.problem.estimated_cameras())
     cov = camera_covariance(adjusted).of(READOUT)[:, 0, :, 0][np.ix_(cameras, cameras)]
     total = np.abs(adjusted.problem.readout_s[cameras] + readout_s)
-    possible = not timing.period_s or bool((total < timing.period_s + POSSIBLE * np.sqrt(np.diag(cov))).all())
+    possible = not timing.period_s or bool((total < timing.period_s + CLEAR * np.sqrt(np.diag(cov))).all())
     return possible and _is_significant(readout_s, cov, len(cameras), adjusted)
 
 

@@ -16,10 +16,10 @@ import cv2
 import msgspec
 import numpy as np
 
+from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_weights
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import FOCAL, calibrated_sigma
 from calib.wand.bundle_adjustment.problem_setup import MIN_SIGMA_PX
-from calib.wand.bundle_adjustment.residuals import CAUCHY_SCALE
 from calib.wand.initial_rig import GATE_PX, MIN_COMMON, TwoViewGeometry, sampson, spread_evenly
 from calib.wand.labels import label_recording
 from camera_node.foundation.arrays import Array, Index
@@ -28,18 +28,17 @@ from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector, skew
 from camera_node.protocol.messages import Detections
 
-STEPS = (
+GRID = (
     9  # of a grid, within two standard deviations: a quarter apart, where lenses are known by a factor of two
 )
 SAMPLE = 150  # correspondences of a pair
 PARTNERS = 4  # of a camera, those with most frame sets in common: more change no start
-ITERATIONS = 10
 SINGULAR = np.diag([1.0, 1.0, 0.0])  # values of an essential matrix
 
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """Half the squared misfits (STEPS, STEPS) of the cameras a and b by the focal lengths of their grids."""
+    """Half the squared misfits (GRID, GRID) of the cameras a and b by the focal lengths of their grids."""
 
     a: int
     b: int
@@ -87,10 +86,10 @@ def find_focal_factors(pairs: TwoViewGeometry, sigma: Array) -> Array:
         pairs: two-view geometry by the given lenses.
         sigma: (C,) prior standard deviations of the logarithms of the focal lengths; 0 of known lenses.
     """
-    steps = np.linspace(-2, 2, STEPS)
+    steps = np.linspace(-2, 2, GRID)
     grids = np.exp(sigma[:, None] * steps)
     tables = [table for a, b in _choose_pairs(pairs) if (table := _tabulate(pairs, a, b, grids)) is not None]
-    starts = [_descend(np.full(len(sigma), k, np.intp), tables, steps**2 / 2) for k in range(STEPS)]
+    starts = [_descend(np.full(len(sigma), k, np.intp), tables, steps**2 / 2) for k in range(GRID)]
     best = min(starts, key=lambda start: start[1])[0]
     return np.take_along_axis(grids, best[:, None], axis=1)[:, 0]
 
@@ -136,7 +135,7 @@ def _tabulate(pairs: TwoViewGeometry, a: int, b: int, grids: Array) -> _Table | 
     sigma = max(float(np.median(sampson(F, x_a, x_b))) / 0.6745, MIN_SIGMA_PX)
     f_a, f_b = np.meshgrid(grids[a] * focal[0], grids[b] * focal[1], indexing="ij")
     misfit = _Epipolar.of(x_a, x_b, f_a.ravel(), f_b.ravel(), sigma).fit(F)
-    return _Table(a, b, misfit.reshape(STEPS, STEPS))
+    return _Table(a, b, misfit.reshape(GRID, GRID))
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,9 +171,9 @@ class _Epipolar:
         U, _, V = np.linalg.svd(np.linalg.inv(self.inverse_b) @ F @ np.linalg.inv(self.inverse_a))
         errors, slopes = self._errors(U, V)
         cost, damping = _cost(errors), np.full(len(U), 1e-3)
-        for _ in range(ITERATIONS):
+        for _ in range(STEPS):
             J = self._jacobians(U, V, slopes)
-            weighted = J / (1 + (errors / CAUCHY_SCALE) ** 2)[:, :, None]
+            weighted = J * cauchy_weights(errors, CAUCHY_SCALE)[:, :, None]
             H = np.swapaxes(weighted, 1, 2) @ J
             H += (damping * np.einsum("gii->g", H))[:, None, None] * np.eye(6)
             step = -np.linalg.solve(H, np.swapaxes(weighted, 1, 2) @ errors[:, :, None])[:, :, 0]

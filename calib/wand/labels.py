@@ -24,6 +24,7 @@ import numpy as np
 from msgspec.structs import replace as replace_fields
 from numpy.typing import NDArray
 
+from calib.rig.estimation import MARGIN
 from calib.rig.rig import Rig
 from calib.wand.detections import FrameTable, Timing, WandDetections, WandRecording, build_tracks, gather
 from calib.wand.initial_rig import InitialRig, TwoViewGeometry, build_initial_rig, sampson
@@ -47,7 +48,6 @@ CLEAR = 3.0  # times the usual change between frames: a longer image vector has 
 FASTEST = 1.0  # change of the image vector, image plane units per second, where no two frames give it
 SIMULTANEOUS_S = 5e-4  # frames closer in time count as simultaneous
 COARSE_PX, FINE_PX = 3.0, 1.5  # scale of epipolar residuals with the poses of the middles, and of the ends
-MIN_EVIDENCE = 6.0  # log likelihood ratio of a sign that is accepted
 SEPARATION_S = 1e4  # added between runs, so that nothing is interpolated across them
 
 
@@ -428,7 +428,7 @@ def _synchronize(count: int, evidence: Sequence[_Evidence]) -> Index:
         if agreement[worst := int(agreement.argmin())] >= 0:
             break
         signs[worst] *= -1
-    return np.where(signs * (graph @ signs) >= MIN_EVIDENCE, signs, 0).astype(np.intp)
+    return np.where(signs * (graph @ signs) >= MARGIN / 2, signs, 0).astype(np.intp)
 
 
 def _span(graph: "coo_array", count: int) -> Array:

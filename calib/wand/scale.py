@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.errors import CalibrationError
+from calib.rig.estimation import CLEAR
 
 SIGMA_M = 0.005  # of a tape measure between two lenses: the projection centres inside are not visible
-CLEAR = 3.0  # standard deviations, beyond which two lengths contradict each other
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 
 from calib.errors import CalibrationError
+from calib.rig.camera import span_dimension
+from calib.rig.estimation import MARGIN
 from calib.wand.detections import WandDetections, ranges
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
@@ -24,18 +26,10 @@ SIGMA_PX = 1.0  # of that distance
 SIGMA_LOG_RANGE = 0.05  # of the logarithm of a range computed from the size of a roundel
 MAX_SIGMAS = 4.0  # of a range or of the slant, in an accepted hypothesis
 SIGMA_LOG_SLANT = 0.2  # of the ratio of ranges along the wand; replaces the ranges where sizes are unknown
-MARGIN = 12.0  # least difference of the squared Mahalanobis distances of the best hypotheses of a frame
 SYMMETRY = 0.15  # relative difference of spacings below which they are not distinguished
 MIN_FRAMES = 20  # that state the spacing of a wand
-MAD_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 MAX_ROUNDELS = 40  # in a frame: the number of triples grows with the cube
 BATCH = 200_000  # triples that are evaluated at once
-
-
-def is_collinear(points: Array) -> bool:
-    """Return whether points (M, 3) lie on a line, to 1 % of their extent."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return len(points) < 3 or bool(spread[1] < 0.01 * spread[0])
 
 
 def require_distinct(wand: Body) -> None:
@@ -62,13 +56,13 @@ def explain_spacing(wand: Body, detections: WandDetections, lenses: Sequence[Len
     share t divides the wand at t zA / (t zA + (1 - t) zC). The depths' errors have no preferred sign, so that the
     median over many frames is precise, and what all sizes have in common cancels.
     """
-    if len(wand.markers) != 3 or not is_collinear(wand.points) or (detections.label >= 0).any():
+    if len(wand.markers) != 3 or span_dimension(wand.points) > 1 or (detections.label >= 0).any():
         return ""
     share, given = _middle_shares(detections, lenses, wand.diameter_m), _middle_share(wand)
     if len(share) < MIN_FRAMES:
         return ""
     found = float(np.median(share))
-    sigma = MAD_SIGMA * float(np.median(np.abs(share - found))) / np.sqrt(len(share))
+    sigma = float(np.median(np.abs(share - found))) / 0.6745 / np.sqrt(len(share))
     # Sizes may err by `SIGMA_LOG_RANGE` in all frames; the derivative of a share s by log zC is s (1 - s).
     if abs(found - given) < found * (1 - found) * SIGMA_LOG_RANGE + MAX_SIGMAS * sigma:
         return ""
@@ -191,7 +185,7 @@ class _PoseSearch:
         triples = np.array(list(permutations(range(rows.shape[1]), 3)), np.intp)
         order = np.argsort(self.along, kind="stable").tolist()
         solve: Callable[[Index, Index, Index], _Candidates]
-        solve = self._solve_line if is_collinear(self.wand.points) else self._solve_p3p
+        solve = self._solve_line if span_dimension(self.wand.points) < 2 else self._solve_p3p
         found = [
             self._test(rows, markers, solve(markers, rows, triples))
             for markers in map(np.array, combinations(order, 3))

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.rig.camera import Camera, transform
+from calib.rig.camera import Camera, span_dimension, transform
 from calib.rig.rig import Rig
 from calib.rig.triangulation import triangulate_points
 from calib.world.still_roundels import StillRoundel, disc_centres, find_still_roundels
-from calib.world.world_frame import align_positions, align_standing_wand, check_above, is_collinear
+from calib.world.world_frame import align_positions, align_standing_wand, check_above
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import ConfigError
@@ -254,11 +254,11 @@ def _merge_points(points: Sequence[Array]) -> Array:
 
 def _candidate_motions(points: Array, surveyed: Array) -> Iterator[Array]:
     """Motions (4, 4) that bring three landmarks (two, on a line) to points with the same mutual distances."""
-    count = 2 if is_collinear(surveyed) else 3
+    count = 2 if span_dimension(surveyed) < 2 else 3
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     for rows in combinations(range(len(surveyed)), count):
         chosen = surveyed[list(rows)]
-        if count == 3 and is_collinear(chosen):
+        if count == 3 and span_dimension(chosen) < 2:
             continue
         for found in _rows_with_distances(distances, chosen):
             yield rigid_motions(chosen, points[list(found)])

@@ -15,22 +15,19 @@ import msgspec
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.rig.camera import Camera, pixel_jacobians, transform
+from calib.rig.camera import Camera, pixel_jacobians, span_dimension, transform
+from calib.rig.estimation import MARGIN, STEPS
+from calib.wand.body_poses import MIN_MARKERS, solve_view
 from calib.world.landmarks import FIT_PX
 from calib.world.still_roundels import StillRoundel
-from calib.world.world_frame import is_collinear
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector, vector_from_rotation
 
 SIGMA_PX = 0.2  # of a mean centre: the centre of the ellipse is not exactly that of the disc
-MIN_POINTS = 4  # three points have up to four poses
 MAX_ASSIGNMENTS = 20_000  # of three roundels to three points: a few seconds
 MAX_MISS = (
     0.05  # RMS distance of the points from their rays over their extent: beyond, names or units are wrong
 )
-ITERATIONS = 10
-MAX_STARTS, DISTINCT_RAD = 8, 0.05  # poses that a fit starts from, and the least angle between two of them
-SEPARATE = 9.0  # by which chi-square of a second pose must exceed that of the first
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +67,9 @@ def place_by_points(
     if not (rows >= 0).any():
         rows = _assign(name, camera, pixels, places)
     seen = np.flatnonzero(rows >= 0)
-    if len(seen) < MIN_POINTS or is_collinear(places[seen]):
+    if len(seen) < MIN_MARKERS or span_dimension(places[seen]) < 2:
         raise CalibrationError(
-            f"camera '{name}' sees {len(seen)} of the points; its pose needs {MIN_POINTS} that are not on a line"
+            f"camera '{name}' sees {len(seen)} of the points; its pose needs {MIN_MARKERS} that are not on a line"
         )
     fit = _fit_uniquely(name, camera, pixels[rows[seen]], places[seen], sigma_m)
     misses = fit.misses_m()
@@ -101,7 +98,7 @@ def _assign(name: str, camera: Camera, pixels: Array, places: Array) -> Index:
     Raises:
         CalibrationError: there are too many roundels, too few of them fit, or two assignments fit as well.
     """
-    chosen = [rows for rows in combinations(range(len(places)), 3) if not is_collinear(places[list(rows)])]
+    chosen = [rows for rows in combinations(range(len(places)), 3) if span_dimension(places[list(rows)]) == 2]
     count = len(pixels) * max(len(pixels) - 1, 0) * max(len(pixels) - 2, 0)
     if len(chosen) * count > MAX_ASSIGNMENTS:
         raise CalibrationError(
@@ -116,9 +113,9 @@ def _assign(name: str, camera: Camera, pixels: Array, places: Array) -> Index:
                 assignment, distance_px = _match(camera, T_cam_world, pixels, places)
                 found[assignment] = min(found.get(assignment, np.inf), distance_px)
     ranked = sorted(found, key=lambda rows: (sum(k >= 0 for k in rows), -found[rows]), reverse=True)
-    if not ranked or sum(k >= 0 for k in ranked[0]) < MIN_POINTS:
+    if not ranked or sum(k >= 0 for k in ranked[0]) < MIN_MARKERS:
         raise CalibrationError(
-            f"camera '{name}' sees {len(pixels)} stationary roundels, of which no {MIN_POINTS} are where the points "
+            f"camera '{name}' sees {len(pixels)} stationary roundels, of which no {MIN_MARKERS} are where the points "
             "are; check the units (metres), and the lens"
         )
     best = ranked[0]
@@ -214,7 +211,7 @@ def _fit_uniquely(name: str, camera: Camera, pixels: Array, places: Array, sigma
     best = fits[0]
     for other in fits[1:]:
         turn = _angle(best.T, other.T)
-        if turn > 1e-3 and other.chi2() < best.chi2() + SEPARATE:
+        if turn > 1e-3 and other.chi2() < best.chi2() + MARGIN:
             raise CalibrationError(
                 f"camera '{name}': two poses fit the points, {np.degrees(turn):.0f} degrees apart; spread the points, "
                 "or put some higher"
@@ -223,21 +220,10 @@ def _fit_uniquely(name: str, camera: Camera, pixels: Array, places: Array, sigma
 
 
 def _fit_from_all_starts(camera: Camera, pixels: Array, places: Array, sigma_m: float) -> Iterator[_Fit]:
-    """Fits from all poses that three of the points allow."""
-    rays = np.column_stack([camera.normalise(pixels), np.ones(len(pixels))])
-    starts = [
-        T
-        for rows in combinations(range(len(places)), 3)
-        if not is_collinear(places[list(rows)])
-        for T in _three_point_poses(rays[list(rows)], places[list(rows)])
-    ]
-    distinct: list[Array] = []
-    for T in sorted(starts, key=lambda T: _Fit(camera, invert(T), pixels, places, sigma_m).chi2()):
-        if len(distinct) < MAX_STARTS and all(_angle(T, other) > DISTINCT_RAD for other in distinct):
-            distinct.append(T)
-    for T in distinct:
+    """Fits from the poses of all points, of which those in a plane have two."""
+    for T in solve_view(places, camera.normalise(pixels)):
         fit = _Fit(camera, invert(T), pixels, places, sigma_m)
-        for _ in range(ITERATIONS):
+        for _ in range(STEPS):
             if not np.isfinite(fit.chi2()):
                 break
             fit = fit.moved()

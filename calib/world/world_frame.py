@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
-from calib.rig.camera import transform
+from calib.rig.camera import span_dimension, transform
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose, rigid_motions
 
 MIN_LEVEL = 0.7  # upward component of a plane's normal: below, the plane is a wall
 MAX_MISFIT = 0.1  # RMS distance over the survey's extent: beyond, names or units are wrong
-MIN_WIDTH = 0.02  # second over first extent: below, positions lie on a line
 
 
 def upright_frame(cameras: Array, points: Array) -> Array:
@@ -174,19 +173,13 @@ def align_standing_wand(rig: Rig, markers: ArrayLike, foot_m: float = 0.0) -> Ri
     return move_rig(rig, _level_frame(z, cameras[0, :3, 0], lowest - foot_m * z))
 
 
-def is_collinear(points: Array) -> bool:
-    """Whether points (N, 3), metres, lie on a line or coincide, or nearly."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < MIN_WIDTH * spread[0] or spread[0] < 1e-6)
-
-
 def _extent(points: Array) -> float:
     """Root mean square distance from the centroid."""
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _check_not_collinear(points: Array, which: str, kind: str) -> None:
-    if is_collinear(points):
+    if span_dimension(points) < 2:
         raise CalibrationError(
             f"the {which} lie on a line, which leaves the rotation about it open; survey a {kind.split()[-1]} away "
             "from that line"

@@ -8,9 +8,9 @@ import msgspec
 import viser
 
 from calib.live.collect import collect_frames
+from calib.rig.camera import span_dimension
 from calib.rig.rig import Rig
 from calib.world.landmarks import FRAME, WAND, WorldChange, align_to_roundels, name_markers
-from calib.world.world_frame import is_collinear
 from camera_node.foundation.config import example_file, load_yaml
 from camera_node.geometry.body import Body
 from web.condition import next_step
@@ -73,7 +73,7 @@ class WorldPanel:
         rig.require_placed(self._files.rig)
         body = load_yaml(self._body_file(), Body)
         standing = self._by.here.value == STANDING
-        if standing and not (len(body.markers) > 1 and is_collinear(body.points)):
+        if standing and span_dimension(body.points) != 1:
             raise WebError(
                 f"{self._files.wand} is not a straight wand with two or more roundels: use an L-frame"
             )

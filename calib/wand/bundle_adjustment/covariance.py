@@ -23,6 +23,7 @@ import msgspec
 import numpy as np
 
 from calib.rig.camera import LENS, Camera, stated_sigma, with_distortion
+from calib.rig.estimation import CHANCE
 from calib.wand.bundle_adjustment.problem import Adjusted, Problem, invert_information
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.lens import Lens
@@ -38,7 +39,6 @@ FOCAL, CENTRE, K1, RATIO, HIGHER = 0.03, 0.02, 0.1, 0.01, (0.1, 0.005, 0.005, 0.
 UNKNOWN_FOCAL = np.log(2) / np.sqrt(3)
 # Factors of these for a lens that the recording shows to be farther off: a file of another lens, or none.
 WIDER = np.array([15.0, 4.0, 4.0, 5.0, 4.0, 4.0, 2.0, 2.0, 4.0])
-CONTRADICTED = 1e-4  # probability below which the recording contradicts standard deviations of a lens
 UNCOMMON = 0.1  # part of the errors of fx and fy that is not common to both
 # Deviations that lenses may share, as shares of the usual ones up to those of another lens, and their prior
 # probabilities: for the estimate, and for the covariance Student's distribution with three degrees of freedom and the
@@ -290,7 +290,7 @@ def _plausible(correction: Array, covariance: Array) -> bool:
     from scipy.special import chdtrc
 
     squared = correction @ np.linalg.solve(covariance, correction)
-    return bool(chdtrc(len(correction), squared) > CONTRADICTED)
+    return bool(chdtrc(len(correction), squared) > CHANCE)
 
 
 def estimate_shares(information: Array, gradient: Array, sigma: Array, unknown: Mask, prior: Array) -> Array:

@@ -17,6 +17,7 @@ from typing import Any, cast
 import numpy as np
 
 from calib.rig.camera import PER_CAMERA, READOUT
+from calib.rig.estimation import CAUCHY_SCALE, GROSS, coordinate_sigma
 from calib.wand.bundle_adjustment.problem import (
     Adjusted,
     Problem,
@@ -25,7 +26,6 @@ from calib.wand.bundle_adjustment.problem import (
     invert_information,
 )
 from calib.wand.bundle_adjustment.residuals import (
-    CAUCHY_SCALE,
     CameraPrior,
     Choice,
     ErrorNorms,
@@ -42,7 +42,6 @@ from calib.wand.bundle_adjustment.residuals import (
 )
 from camera_node.foundation.arrays import Array, Index, Mask
 
-REJECTED = 4.5  # sigmas: one true observation in 25,000 is beyond (chi-square, 2 degrees)
 INTERRUPTED = 4.0  # sigmas, over all coordinates: something hit the wand, or frames are missing
 MAX_ITERATIONS, MAX_ROUNDS = 60, 5
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e6
@@ -154,17 +153,12 @@ def _choose(
     norms = error_norms(problem, observations, state, weights)
     known = norms.observation[before.observations] if before.observations.any() else norms.observation
     beside = point_error_norms(problem, locate_points_robustly(problem, state))
-    most = REJECTED * max(_spread(beside), 1.0) if len(beside) else REJECTED
+    most = GROSS * max(coordinate_sigma(beside), 1.0) if len(beside) else GROSS
     return Choice(
-        observations=norms.observation < REJECTED * max(_spread(known), 1.0),
+        observations=norms.observation < GROSS * max(coordinate_sigma(known), 1.0),
         interrupted=norms.interval > INTERRUPTED,
         background=accept_images(problem, beside, most),
     )
-
-
-def _spread(norms: Array) -> float:
-    """Robust standard deviation of one coordinate: the median of a Rayleigh distribution is 1.1774 of it."""
-    return float(np.median(norms)) / 1.1774
 
 
 def _noise_scale(problem: Problem, observations: WandObservations, state: State, weights: Weights) -> float:
@@ -219,7 +213,7 @@ def _levenberg_marquardt(objective: _Objective, state: State, robust: bool) -> t
     norms, damping = objective.norms(state), 1e-4 if robust else 1e-6
     for iteration in range(1, MAX_ITERATIONS + 1):
         if robust:
-            scale = CAUCHY_SCALE * max(_spread(norms.observation), 1.0)
+            scale = CAUCHY_SCALE * max(coordinate_sigma(norms.observation), 1.0)
             objective = replace(objective, observation_scale=scale, interval_scale=CAUCHY_SCALE)
         before = _Step(state, norms, objective.cost(norms), damping)
         step = _descend(objective, before)

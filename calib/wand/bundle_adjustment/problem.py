@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.camera import LENS, PER_CAMERA, POSE, with_distortion
+from calib.rig.camera import FLAT, LENS, PER_CAMERA, POSE, with_distortion
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
@@ -19,7 +19,6 @@ POSE_SIGMA, OFFSET_SIGMA = [np.inf] * 6, [0.5]
 READOUT_SIGMA = 0.02  # of the readout time, beside what is given, s: rolling shutters take 5 to 40 ms
 # And of the clock's drift, s/s: of a clock that a time service slews, and of a free-running crystal (50 ppm at most).
 SLEWED_DRIFT, CRYSTAL_DRIFT = 5e-4, 3e-5
-COPLANAR = 0.01  # of the wand's extent: markers nearer to the basis's span than this add no basis marker
 SHAKE_ITERATIONS = 4  # that satisfy several lengths together
 
 
@@ -97,7 +96,7 @@ class AffineWand:
             if len(basis) > 1:
                 span = np.linalg.qr((points[basis[1:]] - points[basis[0]]).T)[0]
                 off = off - span @ (span.T @ off)
-            if (distance := np.linalg.norm(off, axis=0)).max() < COPLANAR * extent:
+            if (distance := np.linalg.norm(off, axis=0)).max() < FLAT * extent:
                 break
             basis.append(int(distance.argmax()))
         system = np.vstack([points[basis].T, np.ones(len(basis))])

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.rig.camera import transform
+from calib.rig.estimation import CLEAR
 from calib.rig.triangulation import intersect
 from calib.wand.body_poses import BodyLocator, has_poses
 from calib.wand.bundle_adjustment.covariance import coarse_sigma
@@ -42,7 +43,6 @@ AGREE = 4.0  # times the median of these angles: a ray within agrees with the po
 LENGTH_TOLERANCE = 0.25  # of a wand length: beyond, a detection is wrong
 SPIKE = 5.0  # of the median deviation from the neighbours' straight line
 MIN_AGREEING = 3  # rays that make a position reliable
-STILL = 3.0  # standard deviations of one detection: the images of a point that stands still differ by less
 # Part of the error of a detection that is the same in all images of a point that stands still.
 STILL_SIGMA_PX = 0.05
 MAX_POINTS = 2000  # positions of points that are used
@@ -382,7 +382,7 @@ def _one_point(cameras: list[int], uv: Array, cov: Array) -> BackgroundPoints:
 def _stands_still(detections: WandDetections, rows: Index) -> bool:
     uv, variance = detections.uv[rows], np.median(np.einsum("nii->n", detections.cov[rows])) / 2
     away = uv - np.median(uv, axis=0)
-    return bool(np.median((away**2).sum(axis=1)) <= 2 * STILL**2 * variance)
+    return bool(np.median((away**2).sum(axis=1)) <= 2 * CLEAR**2 * variance)
 
 
 def _average(detections: WandDetections, rows: Index) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.rig.camera import LENS, PER_CAMERA, POSE, pixel_jacobians
+from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_cost, cauchy_weights, coordinate_sigma
 from calib.rig.triangulation import intersect
 from calib.wand.bundle_adjustment.problem import BackgroundPoints, Problem, State, WandObservations
 from calib.wand.trajectory import (
@@ -36,8 +37,6 @@ SCALE_SIGMA = 1e-6  # relative, of a distance that fixes the scale
 STEP_SIGMA_M = 0.5  # of a position's change in one step: damps positions that too few cameras observe
 BEHIND = 1e4  # sigmas: the residual of a point behind its camera
 POINT_STEPS = 3  # of Gauss-Newton: a point moves little while its cameras take one step
-ROBUST_POINT_STEPS = 10
-CAUCHY_SCALE = 2.3849  # sigmas: 95 % efficient on normal residuals
 # Relative information that is added to every coordinate: a point on parallel rays stays where it is.
 REGULAR = 1e-9
 
@@ -236,14 +235,14 @@ class ErrorNorms:
 
     def cost(self, observation_scale: float = np.inf, interval_scale: float = np.inf) -> float:
         """Half the sum of squares, under Cauchy's kernel at these scales; plain squares where a scale is infinite."""
-        smooth = self.size * _cauchy(self.interval**2, interval_scale)
-        return 0.5 * float(_cauchy(self.observation**2, observation_scale) + smooth + self.rest)
+        smooth = self.size * cauchy_cost(self.interval**2, interval_scale)
+        return 0.5 * float(cauchy_cost(self.observation**2, observation_scale) + smooth + self.rest)
 
     def reweight(self, weights: Weights, observation_scale: float, interval_scale: float) -> Weights:
         """The weights with robust ones of Cauchy's kernel at these scales."""
-        observation = 1 / (1 + (self.observation / observation_scale) ** 2)
+        observation = cauchy_weights(self.observation, observation_scale)
         return replace(
-            weights, observation=observation, interval=1 / (1 + (self.interval / interval_scale) ** 2)
+            weights, observation=observation, interval=cauchy_weights(self.interval, interval_scale)
         )
 
 
@@ -259,11 +258,6 @@ def error_norms(
     rest = sum((term**2).sum() for term in (lengths, speed, beside, *priors))
     pixel = whitened_errors(problem, observations, state, weights)
     return ErrorNorms(np.linalg.norm(pixel, axis=1), interval, size, float(rest))
-
-
-def _cauchy(squares: Array, scale: float) -> float:
-    """Sum of squares under Cauchy's kernel; plain where `scale` is infinite."""
-    return float(squares.sum() if np.isinf(scale) else (scale**2 * np.log1p(squares / scale**2)).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,10 +409,10 @@ def locate_points(problem: Problem, state: State, used: Mask) -> State:
 
 def locate_points_robustly(problem: Problem, state: State) -> State:
     """The same from all images, with Cauchy's weights at a scale that the residuals give."""
-    for _ in range(ROBUST_POINT_STEPS if len(state.points) else 0):
+    for _ in range(STEPS if len(state.points) else 0):
         norms = point_error_norms(problem, state)
-        scale = CAUCHY_SCALE * max(float(np.median(norms)) / 1.1774, 1.0)
-        state = _step_points(problem, state, 1 / (1 + (norms / scale) ** 2))
+        scale = CAUCHY_SCALE * max(coordinate_sigma(norms), 1.0)
+        state = _step_points(problem, state, cauchy_weights(norms, scale))
     return state
 
 

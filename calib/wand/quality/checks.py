@@ -20,6 +20,7 @@ import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, lens_parameters
+from calib.rig.estimation import CHANCE, CLEAR, GROSS, coordinate_sigma
 from calib.rig.triangulation import intersect
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations
@@ -38,10 +39,6 @@ MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
 WRONG_CLOCK_S = (
     1.0  # offset: synchronized clocks differ by milliseconds, unsynchronized ones by more than a second
 )
-SAME_LENS = 3.0  # sigmas, per parameter, within which a lens is that of another camera
-OTHER_LENS = 1e-9  # probability of the difference, below which a lens is not that of its own file
-GROSS = 4.5  # standard deviations of the residuals: a larger one is a gross error, as in the adjustment
-RAYLEIGH_MEDIAN = 1.1774  # in standard deviations of one coordinate
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
 CLEARLY = 0.25  # of this distance, that the rays of synchronous cameras pass each other at most, if exchanged rightly
 MIN_SHARE, MIN_COUNT = 0.02, 8  # of a camera's detections, from which its points count as exchanged
@@ -61,7 +58,7 @@ def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
             _lens_distance(found[a], lenses[a], cov[a, :, a]),
             _lens_distance(found[b], lenses[b], cov[b, :, b]),
         )
-        if max(crossed) < min(SAME_LENS, min(straight) / 2) and _probability(min(straight)) < OTHER_LENS:
+        if max(crossed) < min(CLEAR, min(straight) / 2) and _probability(min(straight)) < CHANCE:
             swapped = (
                 "its detections fit the intrinsics of '{}', and vice versa; swap the two in the rig file"
             )
@@ -216,7 +213,7 @@ class TriangulatedResiduals:
         if not known.any():
             return None
         norms, distance = np.linalg.norm(self.pixels[known], axis=1), self.range_m[known]
-        fine = norms <= GROSS * np.median(norms) / RAYLEIGH_MEDIAN
+        fine = norms <= GROSS * coordinate_sigma(norms)
         return Validation(
             count=len(norms),
             all_px=_rms(norms),

@@ -13,16 +13,15 @@ import numpy as np
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import lens_parameters
+from calib.rig.estimation import CHANCE, GROSS, coordinate_sigma
 from calib.wand.bundle_adjustment.covariance import lens_evidence
 from calib.wand.bundle_adjustment.problem import Adjusted
 from calib.wand.bundle_adjustment.problem_setup import MIN_SIGMA_PX
 from calib.wand.detections import WandRecording
 from calib.wand.quality.checks import (
     GATE,
-    GROSS,
     MIN_COUNT,
     MIN_SHARE,
-    RAYLEIGH_MEDIAN,
     TriangulatedResiduals,
 )
 from camera_node.foundation.arrays import Array, Mask
@@ -30,7 +29,6 @@ from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, vector_from_rotation
 
-CLEAR = np.log(1e4)  # of a Bayes factor: probability of a false alarm below 1e-4
 SEPARATED = 0.8  # nine of ten on either side of a time: the share before it less the other one
 HALF = 0.5  # of a camera's contradicting detections, that a second pose must explain
 MIRRORS = {"left to right": (True, False), "top to bottom": (False, True), "": (True, True)}
@@ -50,7 +48,7 @@ def check_mirrored(wand: Body, adjusted: Adjusted) -> None:
         )
     evidence = {name: lens_evidence(adjusted, _mirror(adjusted, *axes)) for name, axes in MIRRORS.items()}
     name = max(evidence, key=evidence.__getitem__)
-    if evidence[name] > CLEAR and name:
+    if evidence[name] > -np.log(CHANCE) and name:
         u = "u by width - 1 - u" if name == "left to right" else "v by height - 1 - v"
         raise CalibrationError(
             f"the images of all cameras are mirrored {name}: so mirrored, their lenses fit those of the rig file "
@@ -110,7 +108,7 @@ def check_residuals(
     known = np.isfinite(off)
     if not known.any():
         return
-    usual = max(float(np.median(off[known])) / RAYLEIGH_MEDIAN, MIN_SIGMA_PX)
+    usual = max(coordinate_sigma(off[known]), MIN_SIGMA_PX)
     gross = known & (off > GROSS * usual)
     moved: list[tuple[int, str, str]] = []
     for k, lens in enumerate(lenses):

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from calib.rig.camera import LENS, lens_parameters
+from calib.rig.estimation import CLEAR
 from calib.wand.bundle_adjustment.covariance import FOCAL, camera_covariance
 from calib.wand.bundle_adjustment.problem import Adjusted
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
-CLEAR = 2.0  # sigmas, root mean square of the parameters, above which a lens is reported as changed
-FAR = 3.0  # sigmas of a single parameter besides focal length, centre and k1, above which it is named
+CHANGED = 2.0  # sigmas, root mean square of the parameters, above which a lens is reported as changed
 HIGHER = {"pinhole": ("fx / fy", "k2", "p1", "p2", "k3"), "fisheye": ("fx / fy", "k2", "k3", "k4")}
 
 
@@ -56,7 +56,7 @@ class LensChange:
         """The other parameters that changed clearly: name, before, after and standard deviation."""
         names = HIGHER[self.before.model]  # a fisheye has one parameter less
         columns = zip(names, _shape(self.before), _shape(self.after), self.sigma[4:], strict=False)
-        return [row for row in columns if abs(row[2] - row[1]) > FAR * row[3]]
+        return [row for row in columns if abs(row[2] - row[1]) > CLEAR * row[3]]
 
     def as_dict(self) -> dict[str, Any]:
         """The values before, and standard deviations after, for the `calibration` map of `rig.yaml`."""
@@ -103,7 +103,7 @@ def describe_open_lenses(ranges: Mapping[str, tuple[float, float]]) -> str:
 
 def describe_lens_changes(changes: dict[str, LensChange]) -> list[str]:
     """The significant changes for the user, line by line."""
-    clear = {name: change for name, change in changes.items() if change.sigmas > CLEAR}
+    clear = {name: change for name, change in changes.items() if change.sigmas > CHANGED}
     lines = (
         ["the recording corrects lenses; the written rig has the new values (before -> after)"]
         if clear
@@ -112,7 +112,7 @@ def describe_lens_changes(changes: dict[str, LensChange]) -> list[str]:
     lines += [f"lens of {name}: {change.sentence()}" for name, change in clear.items()]
     if rest := [name for name in changes if name not in clear]:
         lines.append(
-            f"unchanged within {CLEAR:g} sigmas: the lens{'es' * (len(rest) > 1)} of {', '.join(rest)}"
+            f"unchanged within {CHANGED:g} sigmas: the lens{'es' * (len(rest) > 1)} of {', '.join(rest)}"
         )
     return lines
 

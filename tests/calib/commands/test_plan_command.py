@@ -55,7 +55,7 @@ def test_the_result_of_a_rig_as_json_and_pdf(tmp_path: Path):
 
 def test_a_suggested_plan_can_be_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     """With a smaller search than the command's; the written plan has the result that was printed."""
-    for name, value in {"PLACES": 6, "AIMS": 3, "STARTS": 1, "SWEEPS": 1, "EVALUATIONS": 10}.items():
+    for name, value in {"PLACES": 6, "AIMS": 3, "STARTS": 1}.items():
         monkeypatch.setattr(placement, name, value)
     out = tmp_path / "suggested.yaml"
     parse(PlanArena, "roundel plan", [str(SHIPPED), "--suggest", "2", "--out", str(out)]).run()

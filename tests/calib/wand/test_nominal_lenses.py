@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.focal_lengths import STEPS, with_rough_focal_lengths
+from calib.wand.focal_lengths import GRID, with_rough_focal_lengths
 from calib.wand.nominal_lens import nominal_lens, with_nominal_lenses
 from calib.wand.quality.grade import assess
 from camera_node.geometry.body import Body
@@ -81,7 +81,7 @@ def test_rough_focal_lengths_are_found_between_half_and_twice_the_guess():
     found = with_rough_focal_lengths(Rig(cameras=given), arena.wand, messages).cameras
     assert found["cam3"] == given["cam3"]
     ratios = [found[name].fx / truth[name].fx for name in factors]
-    step = 4 * math.log(2) / math.sqrt(3) / (STEPS - 1)
+    step = 4 * math.log(2) / math.sqrt(3) / (GRID - 1)
     assert np.abs(np.log(ratios)).max() < step
 
 

@@ -87,7 +87,7 @@ LINE = {str(k): np.array([0.3 * k - 0.6, 0.0, 0.0]) for k in range(5)}
             {"0": POINTS["1"], "1": POINTS["0"], "2": POINTS["3"], "3": POINTS["2"], "4": POINTS["4"]},
             POINTS,
             True,
-            "mm from",
+            "check their names",
         ),
     ],
 )
