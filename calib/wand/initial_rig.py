@@ -58,9 +58,8 @@ MIN_TIMES = 15  # timestamps with correspondences; the markers of one frame add 
 # Inlier ratio and frames of two cameras once the fault is undone: a short piece of a smooth path fits many geometries.
 MIN_FAULT_RATIO, MIN_FAULT_FRAMES = 0.8, 60
 UNSYNCHRONIZED_S, UNSYNCHRONIZED_STEP_S = 10.0, 0.04  # of the shifts of an unsynchronized clock
-APART_S = 2.0  # least gap between recordings; cameras of one recording may start one after the other
 MIN_MISFIT = 1e-6  # of the image plane
-FAULT_SAMPLE = 200  # detections that are used
+APART_S = 2.0  # least gap between recordings; cameras of one recording may start one after the other
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,31 +297,45 @@ def intersect_rays(T_a_b: Array, xy_a: Array, xy_b: Array) -> Array:
     return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:], float)
 
 
-def find_shift(tracks: Sequence[MarkerTrack], detections: WandDetections, gap_s: float) -> float:
+def find_shift(
+    tracks: Sequence[MarkerTrack],
+    detections: WandDetections,
+    gap_s: float,
+    reach_s: float = MAX_SHIFT_S,
+    step_s: float = SHIFT_STEP_S,
+) -> float:
     """Return how much later the timestamps of camera b are than those of a, seconds; 0 if the data show no shift.
 
     Args:
         tracks: of camera b, by marker.
         detections: of camera a.
         gap_s: the longest gap over which the tracks are interpolated.
+        reach_s, step_s: the largest shift that is tried, and the first grid; the second one is ten times as fine.
     """
     if not len(detections):
         return 0.0
     detections = detections.select(spread_evenly(len(detections), SHIFT_SAMPLE))
     label, t_s, xy = detections.label, detections.t_s, detections.xy
-    coarse = SHIFT_STEP_S * np.arange(
-        -round(MAX_SHIFT_S / SHIFT_STEP_S), round(MAX_SHIFT_S / SHIFT_STEP_S) + 1
-    )
-    misfits = epipolar_misfits(xy, interpolate(tracks, label, t_s + coarse[:, None], gap_s))
-    unshifted = misfits[len(coarse) // 2]
-    best = int(np.nanargmin(misfits)) if np.isfinite(misfits).any() else len(coarse) // 2
-    common = np.isfinite(interpolate(tracks, label, t_s + coarse[best], gap_s)[:, 0])
-    times = len(np.unique(t_s[common]))
-    if times < MIN_TIMES or not supports_shift(unshifted, misfits[best], int(common.sum()), times):
+    middle = round(reach_s / step_s)
+    coarse = step_s * np.arange(-middle, middle + 1)
+    there = interpolate(tracks, label, t_s + coarse[:, None], gap_s)
+    misfits = epipolar_misfits(xy, there)
+    known = np.isfinite(misfits)
+    if not known.any():
         return 0.0
-    fine = coarse[best] + SHIFT_STEP_S * np.linspace(-1, 1, 11)
+    # Few correspondences fit an epipolar geometry by chance: the gain of a shift is weighted by their number.
+    common = np.isfinite(there[:, :, 0])
+    usual = np.median(misfits[known])
+    better = np.log((usual + MIN_MISFIT) / (np.where(known, misfits, usual) + MIN_MISFIT))
+    best = int(np.where(known, (common.sum(axis=1) - FITTED) * better, -np.inf).argmax())
+    times = len(np.unique(t_s[common[best]]))
+    if times < MIN_TIMES or not supports_shift(
+        misfits[middle], misfits[best], int(common[best].sum()), times
+    ):
+        return 0.0
+    fine = coarse[best] + step_s * np.linspace(-1, 1, 11)
     misfits = epipolar_misfits(xy, interpolate(tracks, label, t_s + fine[:, None], gap_s))
-    return float(fine[np.nanargmin(misfits)]) if np.isfinite(misfits).any() else float(coarse[best])
+    return float(fine[np.argmin(misfits)])
 
 
 def spread_evenly(count: int, most: int) -> Index:
@@ -569,26 +582,13 @@ def _mirrored(pairs: TwoViewGeometry, k: int) -> TwoViewGeometry:
 
 def _find_large_shift(pairs: TwoViewGeometry, k: int, other: int) -> float:
     """Return the shift by which camera k's timestamps are late, if it makes k fit the other camera; else 0."""
-    detections, rows = pairs.detections, pairs.rows[other]
-    rows = rows[spread_evenly(len(rows), FAULT_SAMPLE)]
-    shifts = UNSYNCHRONIZED_STEP_S * np.arange(
-        -round(UNSYNCHRONIZED_S / UNSYNCHRONIZED_STEP_S), round(UNSYNCHRONIZED_S / UNSYNCHRONIZED_STEP_S) + 1
-    )
-    times = detections.t_s[rows] + shifts[:, None]
-    there = interpolate(pairs.tracks[k], detections.label[rows], times, pairs.gap_s)
-    misfits = epipolar_misfits(detections.xy[rows], there)
-    known = np.isfinite(misfits)
-    if not known.any():
-        return 0.0
-    # Few correspondences fit an epipolar geometry by chance: the gain of a shift is weighted by their number.
-    redundancy = np.isfinite(there[known, :, 0]).sum(axis=1) - FITTED
-    gain = redundancy * np.log((np.median(misfits[known]) + MIN_MISFIT) / (misfits[known] + MIN_MISFIT))
-    shift_s = float(shifts[known][gain.argmax()])
+    detections = pairs.detections
+    seen = detections.select(pairs.rows[other])
+    shift_s = find_shift(pairs.tracks[k], seen, pairs.gap_s, UNSYNCHRONIZED_S, UNSYNCHRONIZED_STEP_S)
     t_s = detections.t_s.copy()
     t_s[pairs.rows[k]] -= shift_s
-    return (
-        shift_s if _fits(pairs.with_detections(replace(detections, t_s=t_s)), k, other) is not None else 0.0
-    )
+    moved = pairs.with_detections(replace(detections, t_s=t_s))
+    return shift_s if shift_s and _fits(moved, k, other) is not None else 0.0
 
 
 def explain_unplaced(
@@ -661,21 +661,10 @@ def explain_failure(
         reasons = "; ".join(f"camera '{name}': {fault}" for name, fault in faults.items())
         return f"no two cameras could be placed: {reasons}"
     pairs = np.triu(shared, 1)
+    a, b = divmod(int(pairs.argmax()), len(pairs))
     frames = ", ".join(f"{name} {n}" for name, n in zip(names, counts, strict=True))
-    if not pairs.any():
-        return (
-            f"no two cameras ever saw the wand at once (frames with the wand: {frames}); wave the wand where views "
-            "overlap"
-        )
-    if pairs.max() >= MIN_FRAME_SETS:
-        a, b = divmod(int(pairs.argmax()), len(pairs))
-        return (
-            f"no two cameras could be placed, although '{names[a]}' and '{names[b]}' saw the wand at once "
-            f"{pairs.max()} times: their detections do not fit a wand with these markers; measure the wand, and check "
-            "the intrinsics of the cameras"
-        )
     return (
-        f"no two cameras saw the wand at once in {MIN_FRAME_SETS} frame sets or more, at the most in {pairs.max()} "
-        f"(frames with the wand: {frames}); if it was waved, wave it where views overlap, and check the diameter and "
-        "the markers of the wand file"
+        f"no two cameras could be placed: '{names[a]}' and '{names[b]}' saw the wand at once in {pairs.max()} frame "
+        f"sets, others in fewer, and {MIN_FRAME_SETS} that fit one wand are needed (frames with the wand: {frames}); "
+        "wave it where views overlap, check the diameter and the markers of the wand file, and the intrinsics"
     )

@@ -36,9 +36,7 @@ MAX_SIZE_ERROR = 0.04
 MAX_SPACING_ERROR = 0.03  # of the wand's length: the error of any distance between its markers is below it
 MIN_MEASURED = 8  # frame sets at which a distance is measured
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
-WRONG_CLOCK_S = (
-    1.0  # offset: synchronized clocks differ by milliseconds, unsynchronized ones by more than a second
-)
+WRONG_CLOCK_S = 1.0  # offset: synchronized clocks differ by milliseconds, others by more than a second
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
 CLEARLY = 0.25  # of this distance, that the rays of synchronous cameras pass each other at most, if exchanged rightly
 MIN_SHARE, MIN_COUNT = 0.02, 8  # of a camera's detections, from which its points count as exchanged

@@ -125,7 +125,7 @@ def test_two_cameras_that_rarely_see_the_wand_at_once_are_refused():
     messages = of("cam1", lambda m: m if m.seq < 6 else without_roundels(m), numbered(2))
     with pytest.raises(
         CalibrationError,
-        match=r"at the most in [1-6] \(frames with the wand: cam0 \d+, cam1 [1-6]\); .*views overlap",
+        match=r"at once in [1-6] frame sets.* \(frames with the wand: cam0 \d+, cam1 [1-6]\); .*views overlap",
     ):
         calibrate(ring(2).intrinsics, WAND, messages)
 
