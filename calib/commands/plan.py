@@ -115,7 +115,7 @@ class PlanArena:
 
 def planned_cameras(placement: SuggestedPlaces, kind: CameraKind) -> dict[str, PlannedCamera]:
     """Suggested cameras as entries of a plan."""
-    fields = {name: getattr(kind, name) for name in CameraKind.__struct_fields__}
+    fields = msgspec.structs.asdict(kind)
     pairs = zip(placement.positions_m.tolist(), placement.aims_m.tolist(), strict=True)
     return {
         f"camera-{k}": PlannedCamera(**fields, position_m=_rounded(position), look_at_m=_rounded(aim))

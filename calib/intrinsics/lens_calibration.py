@@ -21,7 +21,7 @@ from calib.intrinsics.lens_adjustment import (
     locate_board,
 )
 from calib.rig.camera import Camera, stated_sigma
-from calib.rig.coverage import Coverage, cell_centres, enumerate_words, region_of
+from calib.rig.coverage import Coverage, cell_centres, choose_covering, enumerate_words, region_of
 from calib.rig.estimation import CLEAR
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array, Grey
@@ -286,18 +286,11 @@ def is_from_behind(view: BoardView) -> bool:
 
 
 def choose_views(views: Sequence[BoardView], size: tuple[int, int], most: int = MAX_VIEWS) -> list[BoardView]:
-    """Select up to `most` views that fill the image evenly: each next one adds most to the cells with few corners."""
+    """Select up to `most` views that fill the image evenly."""
     if len(views) <= most:
         return list(views)
-    counts = [Coverage.of(view.area, *size).counts.astype(float) for view in views]
-    filled, chosen = np.zeros_like(counts[0]), []
-    remaining = list(range(len(views)))
-    while len(chosen) < most:
-        best = max(remaining, key=lambda k: float((counts[k] / (1 + filled)).sum()))
-        filled += counts[best]
-        chosen.append(best)
-        remaining.remove(best)
-    return [views[k] for k in sorted(chosen)]
+    counts = np.array([Coverage.of(view.area, *size).counts.ravel() for view in views], float)
+    return [view for view, chosen in zip(views, choose_covering(counts, most), strict=True) if chosen]
 
 
 def _start(views: Sequence[BoardView], size: tuple[int, int], model: Model) -> tuple[Lens, list[BoardView]]:

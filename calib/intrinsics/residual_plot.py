@@ -5,13 +5,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig.coverage import CELLS
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 
 WIDTH = 1200  # pixels of the plot
 TITLE = 34  # pixels above it
 ARROW = 18  # pixels, the length of the 90 % quantile of the residuals
-CELLS = (6, 8)  # rows and columns, over which mean residuals are drawn
 MIN_POINTS = 4  # in a cell with a mean residual
 SHIFT = 4  # OpenCV draws in 1/16 pixels
 PAPER, INK, MEAN, SHADE = (252, 252, 250), (60, 50, 40), (200, 90, 20), (205, 225, 250)

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from calib.errors import CalibrationError
 from calib.rig.coverage import Coverage
+from calib.rig.rig import MAX_CAMERAS
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.terminal import progress_console
 from camera_node.protocol.messages import CameraStatus, Detections, Keys, MessageError, decode
@@ -26,7 +27,6 @@ SILENT_S = 2.0  # without a frame: the camera counts as silent
 COMPARED_NS = 500_000_000  # between two frames that show whether a roundel moves
 MOVED_PX = 10.0  # in that time; a wand that is held still moves as far
 LISTEN_S = 2.5  # a camera publishes its status once a second
-MAX_CAMERAS = 256
 
 
 @dataclass(slots=True)

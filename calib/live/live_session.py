@@ -23,8 +23,7 @@ from calib.live.trials import Trial, TrialSolver, WandSession
 MAX_ADDED_ERROR = 0.05  # that a camera's covariance may add to the error of a pixel, as a fraction of it
 MIN_USED = 0.5  # of the image area that a camera shares with others
 MIN_GROWTH = 0.01  # of the used area, summed over cameras: less counts as none
-IDLE_S = 15.0  # without growth of the used area
-GONE_S = 15.0  # without a roundel that moves: the wand is gone
+GONE_S = 15.0  # without a roundel that moves: the wand is gone; or without growth of the used area
 PAUSE_S = 3.0  # without a roundel that moves: the progress line reports it
 
 
@@ -88,7 +87,7 @@ class StoppingRule:
             return False
         # Variances add: (1 + ratio^2) ^ 1/2 < 1 + MAX_ADDED_ERROR.
         precise = max(trial.noise_ratio.values()) ** 2 < (1 + MAX_ADDED_ERROR) ** 2 - 1
-        return precise and (min(trial.used.values()) >= MIN_USED or now_s - self.grew_s > IDLE_S)
+        return precise and (min(trial.used.values()) >= MIN_USED or now_s - self.grew_s > GONE_S)
 
 
 def is_wand_gone(collected: CollectedFrames, elapsed: float, trial: Trial | None, trials: bool) -> bool:

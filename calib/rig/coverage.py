@@ -54,6 +54,19 @@ class Coverage:
         return sorted((name for name in shares if shares[name] < MIN_SHARE), key=shares.__getitem__)
 
 
+def choose_covering(counts: Array, most: int) -> Mask:
+    """(n,) at most `most` of n parts that together fill all cells evenly, from their points (n, cells) in each.
+
+    Greedy: each next part is the one with most points in cells that have few so far.
+    """
+    filled, chosen = np.zeros(counts.shape[1]), np.zeros(len(counts), bool)
+    for _ in range(min(most, len(counts))):
+        best = int(np.where(chosen, -1.0, counts @ (1 / (1 + filled))).argmax())
+        filled += counts[best]
+        chosen[best] = True
+    return chosen
+
+
 def regions(shape: tuple[int, ...]) -> list[tuple[str, tuple[slice, slice]]]:
     """The nine regions of a grid of cells: name, and slices of rows and columns."""
     rows, columns = (np.linspace(0, n, 4).round().astype(int) for n in shape)

@@ -100,20 +100,23 @@ def intersect(ray: Array, centre: Array, known: Mask, rounds: int = REWEIGHTINGS
     return points, angle
 
 
+def intersect_images(xy: Array, poses: Array, rounds: int = REWEIGHTINGS) -> tuple[Array, Array, Mask]:
+    """As `intersect`, of image plane coordinates (C, M, K, 2), NaN where unknown, of cameras with poses (C, 4, 4); and
+    which (C, M, K) are known."""
+    known = np.isfinite(xy[..., 0])
+    ray = np.concatenate([np.nan_to_num(xy), np.ones((*known.shape, 1))], axis=3)
+    ray = np.einsum("cij,cmkj->cmki", poses[:, :3, :3], ray / np.linalg.norm(ray, axis=3, keepdims=True))
+    return *intersect(ray, poses[:, :3, 3], known, rounds), known
+
+
 def _nearest_to_rays(cameras: Sequence[Camera], uv: Array) -> Array:
     """(N, 3) points nearest to the rays of pixels (C, N, 2); NaN where these are nearly parallel."""
-    A, b = np.zeros((uv.shape[1], 3, 3)), np.zeros((uv.shape[1], 3))
-    for camera, pixels in zip(cameras, uv, strict=True):
-        seen, T = np.isfinite(pixels).all(axis=1), camera.matrix()
-        d = camera.rays(pixels[seen]) @ T[:3, :3].T
-        across = np.eye(3) - d[:, :, None] * d[:, None]
-        A[seen] += across
-        b[seen] += across @ T[:3, 3]
-    known = np.flatnonzero(np.isfinite(A).all(axis=(1, 2)))
-    known = known[np.linalg.eigvalsh(A[known])[:, 0] >= MIN_ANGLE**2]
-    p = np.full(b.shape, np.nan)
-    p[known] = np.linalg.solve(A[known], b[known][:, :, None])[:, :, 0]
-    return p
+    T = np.array([camera.matrix() for camera in cameras]).reshape(-1, 4, 4)
+    pairs = zip(cameras, np.nan_to_num(uv), T[:, :3, :3], strict=True)
+    rays = np.array([camera.rays(pixels) @ R.T for camera, pixels, R in pairs])[:, None]
+    seen = np.asarray(np.isfinite(uv).all(axis=2))[:, None]
+    known = seen & np.asarray(np.isfinite(rays).all(axis=3))
+    return intersect(np.nan_to_num(rays), T[:, :3, 3], known, rounds=1)[0][0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -156,18 +156,29 @@ class _Signal:
         return np.nan_to_num(np.clip(moved, -limit, limit))
 
 
+@dataclass(frozen=True, slots=True)
+class _Match:
+    """The stamp of b that belongs to a stamp t of a: t (1 + rate) + shift."""
+
+    shift_s: float
+    rate: float
+
+
 def _chain(signals: dict[str, _Signal]) -> dict[str, ClockMap]:
-    """Maps of the cameras into the clock of the one that has the longest tracks, directly or by others."""
+    """Maps of the cameras into the clock of the one that has the longest tracks, directly or by others: first by clocks
+    that agree, which is soon tested, then by clocks that differ."""
     order = sorted(signals, key=lambda name: -sum(len(t.t_s) for t in signals[name].tracks.values()))
     maps = {name: ClockMap(0.0, 0.0) for name in order[:1]}
-    reached = list(maps)
-    for a in reached:  # grows
-        for b in [name for name in order if name not in maps]:
-            if (match := _match(signals[a], signals[b])) is not None:
-                known, scale = maps[a], 1 / (1 + match.rate)
-                shift_s = (1 + known.rate) * scale * match.offset_s
-                maps[b] = ClockMap(known.offset_s - shift_s, (1 + known.rate) * scale - 1)
-                reached.append(b)
+    for search in (_agree, _match):
+        reached = list(maps)
+        for a in reached:  # grows
+            for b in [name for name in order if name not in maps]:
+                match = search(signals[a], signals[b])
+                if match is not None:
+                    known, scale = maps[a], 1 / (1 + match.rate)
+                    shift_s = (1 + known.rate) * scale * match.shift_s
+                    maps[b] = ClockMap(known.offset_s - shift_s, (1 + known.rate) * scale - 1)
+                    reached.append(b)
     return maps
 
 
@@ -199,14 +210,31 @@ def _relative_to_most(maps: dict[str, ClockMap]) -> dict[str, ClockMap]:
     }
 
 
-def _match(a: _Signal, b: _Signal) -> ClockMap | None:
-    """The stamps of b that belong to those of a, by the offset and the rate under which both show the same motion; None
-    unless these are certain, and one epipolar geometry confirms them."""
+def _scales(a: _Signal, b: _Signal) -> tuple[float, float, float]:
+    """Seconds: the grid, the step of the velocities, and the width of their correlation."""
+    grid_s, step_s = max(a.timing.period_s, b.timing.period_s, GRID_S), max(a.step_s, b.step_s)
+    return grid_s, step_s, _width(a, list(a.tracks), grid_s, step_s)
+
+
+def _agree(a: _Signal, b: _Signal) -> _Match | None:
+    """No shift, if two cameras show the same motion at the same stamps, as far as an adjustment finds the rest."""
     labels = [label for label in a.tracks if label in b.tracks]
     if not labels:
         return None
-    grid_s, step_s = max(a.timing.period_s, b.timing.period_s, GRID_S), max(a.step_s, b.step_s)
-    scales_s = grid_s, step_s, _width(a, list(a.tracks), grid_s, step_s)
+    scales_s = _scales(a, b)
+    found = _best(list(_trials(a, b, labels, scales_s, (0.0,))), scales_s[2], 0.0)
+    if found is None or abs(found.shift_s) > MAX_SHIFT_S:
+        return None
+    return _Match(0.0, 0.0) if _keeps_rate(a, b, labels, scales_s, found.shift_s) else None
+
+
+def _match(a: _Signal, b: _Signal) -> _Match | None:
+    """The shift and the rate under which two cameras show the same motion; None unless they are certain, and one
+    epipolar geometry confirms them."""
+    labels = [label for label in a.tracks if label in b.tracks]
+    if not labels:
+        return None
+    scales_s = _scales(a, b)
     span_s = min(float(np.ptp(a.span)), float(np.ptp(b.span)))
     count = int(np.ceil(MAX_RATE * span_s / scales_s[2]))
     rates = (np.arange(-count, count + 1) * MAX_RATE / count).tolist()
@@ -218,18 +246,18 @@ def _match(a: _Signal, b: _Signal) -> ClockMap | None:
     return found if _is_confirmed(a, b, labels[0], found) else None
 
 
-def _is_confirmed(a: _Signal, b: _Signal, label: int, found: ClockMap) -> bool:
+def _is_confirmed(a: _Signal, b: _Signal, label: int, found: _Match) -> bool:
     """Whether one epipolar geometry fits a marker at a shift far better than at any of many others."""
     mine, theirs = a.tracks[label], b.tracks[label]
     rows = spread_evenly(len(mine.t_s), SHIFT_SAMPLE)
     away = np.linspace(-1, 1, OTHERS) * np.ptp(a.span) / 2
-    shifts = found.offset_s + np.concatenate([[0.0], away[np.abs(away) > MAX_SHIFT_S]])
+    shifts = found.shift_s + np.concatenate([[0.0], away[np.abs(away) > MAX_SHIFT_S]])
     there = theirs.interpolate(mine.t_s[rows] * (1 + found.rate) + shifts[:, None], b.timing.gap_s)
     here, *others = epipolar_misfits(mine.xy[rows], there).tolist()
     return here < MISFIT * min(others)
 
 
-def _best(trials: "Sequence[tuple[Array, Array, float]]", width_s: float, reach_s: float) -> ClockMap | None:
+def _best(trials: "Sequence[tuple[Array, Array, float]]", width_s: float, reach_s: float) -> _Match | None:
     """The trial with most evidence; None if that is likely by chance, or if another shift has nearly as much.
 
     Args:
@@ -247,7 +275,21 @@ def _best(trials: "Sequence[tuple[Array, Array, float]]", width_s: float, reach_
     )
     tried = sum(np.ptp(s) / width_s for _, s, _ in trials)
     by_chance = chdtrc(4, evidence[k]) * tried > CHANCE or evidence[k] - second < -2 * np.log(CHANCE)
-    return None if by_chance else ClockMap(float(shifts[k]), rate)
+    return None if by_chance else _Match(float(shifts[k]), rate)
+
+
+def _keeps_rate(
+    a: _Signal, b: _Signal, labels: Sequence[int], scales_s: tuple[float, float, float], shift_s: float
+) -> bool:
+    """Whether no other rate of clocks that are nearly alike has more evidence than the same rate."""
+    at, span_s = np.arange(*a.span, scales_s[0]), min(float(np.ptp(a.span)), float(np.ptp(b.span)))
+    mine = [a.velocities(label, at, scales_s[1]) for label in labels]
+    middle = at.mean()
+    found = []
+    for rate in scales_s[2] / span_s * np.arange(-2, 3):
+        theirs = [b.velocities(label, at + shift_s + rate * (at - middle), scales_s[1]) for label in labels]
+        found.append(_direct_evidence(mine, theirs, 1.0))
+    return int(np.argmax(found)) == 2
 
 
 def _width(a: _Signal, labels: Sequence[int], grid_s: float, step_s: float) -> float:
@@ -317,10 +359,10 @@ def _canonical(aa: Array, bb: Array, ab: Array, count: Array) -> Array:
 
 
 def _refine(
-    a: _Signal, b: _Signal, labels: Sequence[int], scales_s: tuple[float, float, float], start: ClockMap
-) -> ClockMap:
+    a: _Signal, b: _Signal, labels: Sequence[int], scales_s: tuple[float, float, float], start: _Match
+) -> _Match:
     """The best shift and rate near a trial, on finer and finer grids."""
-    (grid_s, step_s, width_s), shift_s, rate = scales_s, start.offset_s, start.rate
+    (grid_s, step_s, width_s), shift_s, rate = scales_s, start.shift_s, start.rate
     at_a = np.arange(a.span[0], a.span[1], grid_s)
     moved = [a.velocities(label, at_a, step_s) for label in labels]
     # In the middle of the overlap, shift and rate are independent.
@@ -339,7 +381,7 @@ def _refine(
             theirs = [b.velocities(label, t_b, step_s) for label in labels]
             found.append(_direct_evidence(moved, theirs, grid_s / (np.pi * scales_s[2])))
         (at, rate), width_s = trials[int(np.argmax(found))], width_s / 2
-    return ClockMap(at - rate * middle, rate)
+    return _Match(at - rate * middle, rate)
 
 
 def _direct_evidence(v_a: Sequence[Array], v_b: Sequence[Array], independent: float) -> float:

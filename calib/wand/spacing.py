@@ -100,14 +100,19 @@ def _middle_shares(detections: WandDetections, lenses: Sequence[Lens], diameter_
     each = np.arange(len(rows))
     a, b, c = (xy[each, (middle + k) % 3] for k in (1, 0, 2))
     z_a, z_c = (z[each, (middle + k) % 3] for k in (1, 2))
-    chord = c - a
-    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-12)
     focal = np.array([(lens.fx + lens.fy) / 2 for lens in lenses])[detections.camera[rows[:, 0]]]
-    off = np.abs(chord[:, 0] * (b - a)[:, 1] - chord[:, 1] * (b - a)[:, 0]) / length * focal
-    t = ((b - a) * chord).sum(axis=1) / length**2
+    off, t = _divide(a, b, c)
     share = t * z_a / (t * z_a + (1 - t) * z_c)
-    good = (off < GATE_PX) & np.isfinite(share) & (share > 0) & (share < 1)
+    good = (off * focal < GATE_PX) & np.isfinite(share) & (share > 0) & (share < 1)
     return np.minimum(share, 1 - share)[good]
+
+
+def _divide(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
+    """Distances (...) of points b (..., 2) from the lines through a and c, and the shares at which they divide them."""
+    chord, to_b = c - a, b - a
+    length = np.maximum(np.linalg.norm(chord, axis=-1), 1e-12)
+    off = np.abs(chord[..., 0] * to_b[..., 1] - chord[..., 1] * to_b[..., 0]) / length
+    return off, (to_b * chord).sum(axis=-1) / length**2
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,10 +202,7 @@ class _PoseSearch:
         """Return poses of a straight wand from triples of collinear detections in the order of the markers."""
         xy = self.detections.xy[rows]
         a, b, c = (xy[:, triples[:, k]] for k in range(3))
-        chord = c - a
-        length = np.maximum(np.linalg.norm(chord, axis=2), 1e-12)
-        off = np.abs(chord[..., 0] * (b - a)[..., 1] - chord[..., 1] * (b - a)[..., 0]) / length
-        share = ((b - a) * chord).sum(axis=2) / length**2
+        off, share = _divide(a, b, c)
         focal = self.focal[self.detections.camera[rows[:, 0]]][:, None]
         frame, triple = np.nonzero((off * focal < GATE_PX) & (share > 0) & (share < 1))
         rays = self.rays[rows[frame[:, None], triples[triple]]]

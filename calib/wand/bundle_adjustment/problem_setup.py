@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from calib.rig.camera import transform
+from calib.rig.coverage import choose_covering
 from calib.rig.estimation import CLEAR
-from calib.rig.triangulation import intersect
+from calib.rig.triangulation import intersect_images
 from calib.wand.body_poses import BodyLocator, has_poses
 from calib.wand.bundle_adjustment.covariance import coarse_sigma
 from calib.wand.bundle_adjustment.problem import (
@@ -39,10 +40,7 @@ MIN_SIGMA_PX = 0.02  # error of every lens model, in addition to the covariance 
 MIN_KNOTS = 2
 WINDOW = 8  # consecutive frame sets that are chosen together, so that the motion between them is estimated
 CELLS = (4, 3)  # columns and rows of an image, for coverage
-AGREE = 4.0  # times the median of these angles: a ray within agrees with the point
 LENGTH_TOLERANCE = 0.25  # of a wand length: beyond, a detection is wrong
-SPIKE = 5.0  # of the median deviation from the neighbours' straight line
-MIN_AGREEING = 3  # rays that make a position reliable
 # Part of the error of a detection that is the same in all images of a point that stands still.
 STILL_SIGMA_PX = 0.05
 MAX_POINTS = 2000  # positions of points that are used
@@ -194,8 +192,6 @@ def group_frames(t_s: Array, camera: Index, spread_s: float) -> Index:
 def choose_frame_sets(detections: WandDetections, frame_set: Index, sizes: Array, budget: int) -> Mask:
     """Which of K frame sets to use, at most about `budget`: all, or windows of them that cover all images evenly.
 
-    Greedy: each next window is the one with most detections in cells that have few so far.
-
     Args:
         detections: n detections in frame sets.
         frame_set: (n,) their frame set.
@@ -210,14 +206,8 @@ def choose_frame_sets(detections: WandDetections, frame_set: Index, sizes: Array
     cell = (detections.camera * CELLS[0] + column) * CELLS[1] + row
     counts = np.zeros((-(-count // WINDOW), len(sizes) * CELLS[0] * CELLS[1]))
     np.add.at(counts, (frame_set // WINDOW, cell), 1.0)
-    total, chosen, available = np.zeros(counts.shape[1]), np.zeros(count, bool), np.ones(len(counts), bool)
-    for _ in range(budget // WINDOW):
-        gain = np.where(available, counts @ (1 / (1 + total)), -1.0)
-        best = int(gain.argmax())
-        available[best] = False
-        total += counts[best]
-        chosen[best * WINDOW : (best + 1) * WINDOW] = True
-    return chosen
+    chosen = np.repeat(choose_covering(counts, budget // WINDOW), WINDOW)
+    return chosen[:count]
 
 
 def initial_positions(
@@ -238,11 +228,8 @@ def initial_positions(
         knot_s: (K,) ascending.
         gap_s: longest time over which positions are interpolated.
     """
-    markers, agreeing = triangulate(tracks, cameras, offset_s, knot_s, gap_s)
-    reliable = np.asarray((np.isnan(markers[:, :, 0]) | (agreeing >= MIN_AGREEING)).all(axis=1))
-    basis = solve_basis(markers, wand)
-    basis = remove_spikes(knot_s, basis, reliable, gap_s)
-    return interpolate_missing(knot_s, basis, gap_s)
+    markers = triangulate(tracks, cameras, offset_s, knot_s, gap_s)
+    return interpolate_missing(knot_s, solve_basis(markers, wand), gap_s)
 
 
 def solve_basis(markers: Array, wand: AffineWand) -> Array:
@@ -257,22 +244,6 @@ def solve_basis(markers: Array, wand: AffineWand) -> Array:
     ends = basis[:, wand.pairs]
     lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
     basis[(np.abs(lengths - wand.lengths) > LENGTH_TOLERANCE * wand.lengths).any(axis=1)] = np.nan
-    return basis
-
-
-def remove_spikes(knot_s: Array, basis: Array, reliable: Mask, gap_s: float) -> Array:
-    """The positions (K, B, 3) with NaN at spikes: knots that are not `reliable` (K,) and deviate from the straight line
-    between their neighbours by much more than usual, and by no less than these do."""
-    if len(knot_s) < 3:
-        return basis
-    share = ((knot_s[1:-1] - knot_s[:-2]) / (knot_s[2:] - knot_s[:-2]))[:, None, None]
-    off = np.linalg.norm(basis[1:-1] - (1 - share) * basis[:-2] - share * basis[2:], axis=2).max(axis=1)
-    off = np.where(np.diff(knot_s)[1:] + np.diff(knot_s)[:-1] <= 2 * gap_s, np.nan_to_num(off), 0.0)
-    usual = np.median(off[off > 0]) if (off > 0).any() else np.inf
-    beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
-    spikes = 1 + np.flatnonzero((off > SPIKE * usual) & (off >= beside))
-    basis = basis.copy()
-    basis[spikes[~reliable[spikes]]] = np.nan
     return basis
 
 
@@ -291,7 +262,7 @@ def interpolate_missing(knot_s: Array, basis: Array, gap_s: float) -> Array:
 
 def triangulate(
     tracks: Sequence[Sequence[MarkerTrack]], poses: Array, offset_s: Array, t_s: Array, gap_s: float
-) -> tuple[Array, Index]:
+) -> Array:
     """Locate the markers at given times, robustly.
 
     Minimises the distances to all viewing rays, reweighted by a Cauchy kernel.
@@ -304,9 +275,8 @@ def triangulate(
         gap_s: the longest gap over which tracks are interpolated.
 
     Returns:
-        points: (K, M, 3) markers, world; NaN if fewer than two cameras saw the marker near that time, or their rays
-            are nearly parallel.
-        agreeing: (K, M) number of rays that agree with the point.
+        (K, M, 3) markers, world; NaN if fewer than two cameras saw the marker near that time, or their rays are nearly
+        parallel.
     """
     xy = np.array(
         [
@@ -314,13 +284,7 @@ def triangulate(
             for markers, offset in zip(tracks, offset_s, strict=True)
         ]
     )  # (C, M, K, 2)
-    known = np.isfinite(xy[..., 0])
-    ray = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:3], 1))], axis=3)
-    ray = np.einsum("cij,cmkj->cmki", poses[:, :3, :3], ray / np.linalg.norm(ray, axis=3, keepdims=True))
-    points, angle = intersect(ray, poses[:, :3, 3], known)
-    usual = float(np.median(angle[known])) if known.any() else 0.0
-    agreeing = (known & (angle <= AGREE * usual)).sum(axis=0)
-    return np.swapaxes(points, 0, 1), agreeing.T
+    return np.swapaxes(intersect_images(xy, poses)[0], 0, 1)
 
 
 def match_points(detections: WandDetections, true_s: Array, gap_s: float) -> BackgroundPoints:

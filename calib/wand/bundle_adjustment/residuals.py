@@ -7,19 +7,17 @@ them in one NumPy batch: every observation depends on one camera and on the two 
 of one camera between two knots are a `view`: rows of derivatives by the knot, the next knot and the camera.
 
 Background points are eliminated, so that they constrain the cameras only. Their positions are optimal for the cameras
-of every state (variable projection: Golub and Pereyra 1973). With J the whitened derivatives of a point's pixels by its
-position and N an orthonormal basis of the null space of J^T, the rows of its pixels times N^T depend on the cameras
-alone (Mourikis and Roumeliotis 2007, section III-D). docs/design/wand_adjustment.md has the equations.
+of every state (variable projection: Golub and Pereyra 1973), and the Schur complement of each point leaves the cameras
+alone. docs/design/wand_adjustment.md has the equations.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.rig.camera import LENS, PER_CAMERA, POSE, pixel_jacobians
 from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_cost, cauchy_weights, coordinate_sigma
-from calib.rig.triangulation import intersect
+from calib.rig.triangulation import intersect_images
 from calib.wand.bundle_adjustment.problem import BackgroundPoints, Problem, State, WandObservations
 from calib.wand.trajectory import (
     SplineLocation,
@@ -440,34 +438,32 @@ def accept_images(problem: Problem, norms: Array, limit: float) -> Mask:
 
 def eliminate_points(problem: Problem, state: State, used: Mask) -> PointInformation:
     """Eliminate the points from the images `used` (n,)."""
-    C, d = len(problem.lenses), len(problem.free)
-    H, scores = np.zeros((C, d, C, d)), np.zeros((len(problem.background), C, d))
+    C, d, n = len(problem.lenses), len(problem.free), len(problem.background)
+    own, scores, crossed = np.zeros((C, d, C, d)), np.zeros((n, C, d)), np.zeros((n, C, 3, d))
     if not used.any():
-        return PointInformation(H, scores)
-    error, J_camera, J_point = _linearize_images(problem, state)
-    for rows, points in _group_by_cameras(problem.background, used):
-        cameras, (m, n) = problem.background.camera[rows[0]], rows.shape
-        free = np.linalg.qr(J_point[rows].reshape(m, 2 * n, 3), mode="complete").Q[:, :, 3:]
-        apart = np.zeros((m, n, 2, n, d))
-        apart[:, range(n), :, range(n)] = np.swapaxes(J_camera[rows], 0, 1)
-        J = np.swapaxes(free, 1, 2) @ apart.reshape(m, 2 * n, n * d)
-        residual = np.swapaxes(free, 1, 2) @ error[rows].reshape(m, 2 * n, 1)
-        G = np.einsum("mri,mrj->ij", J, J, optimize=True).reshape(n, d, n, d)
-        H[np.ix_(cameras, np.arange(d), cameras, np.arange(d))] += G
-        scores[points[:, None], cameras] = (np.swapaxes(J, 1, 2) @ residual).reshape(m, n, d)
-    return PointInformation(H, scores)
+        return PointInformation(own, scores)
+    point, camera = problem.background.point[used], problem.background.camera[used]
+    error, J_camera, J_point = (part[used] for part in _linearize_images(problem, state))
+    for c in range(C):
+        J = J_camera[camera == c].reshape(-1, d)
+        own[c, :, c] = J.T @ J
+    H, g = _point_equations(n, point, error, J_point, np.ones(len(point)))
+    crossed[point, camera] = J_point.mT @ J_camera
+    scores[point, camera] = (J_camera.mT @ error[:, :, None])[:, :, 0]
+    crossed = np.swapaxes(crossed, 1, 2).reshape(n, 3, C * d)
+    response = np.linalg.solve(H, crossed)
+    lost = crossed.reshape(3 * n, -1).T @ response.reshape(3 * n, -1)
+    along = (g[:, None] @ response)[:, 0]
+    return PointInformation(own - lost.reshape(own.shape), scores - along.reshape(scores.shape))
 
 
-def _group_by_cameras(background: BackgroundPoints, used: Mask) -> Iterator[tuple[Index, Index]]:
-    """The rows (m, n) of all m points that the same n cameras see, and the points (m,)."""
-    rows = np.flatnonzero(used)
-    point = background.point[rows]
-    seen = np.zeros((len(background), int(background.camera.max()) + 1), bool)
-    seen[point, background.camera[rows]] = True
-    patterns, of_point = np.unique(seen, axis=0, return_inverse=True)
-    for k, pattern in enumerate(patterns):
-        if (n := int(pattern.sum())) >= 2:
-            yield rows[of_point[point] == k].reshape(-1, n), np.flatnonzero(of_point == k)
+def _point_equations(n: int, point: Index, error: Array, J: Array, weight: Array) -> tuple[Array, Array]:
+    """Hessians (n, 3, 3), regular, and gradients (n, 3) of the points by the weighted errors of their images."""
+    H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    np.add.at(H, point, weight[:, None, None] * J.mT @ J)
+    np.add.at(g, point, weight[:, None] * (J.mT @ error[:, :, None])[:, :, 0])
+    regular = REGULAR * np.einsum("jii->j", H)[:, None, None] + np.finfo(float).tiny
+    return H + regular * np.eye(3), g
 
 
 def _linearize_images(problem: Problem, state: State) -> tuple[Array, Array, Array]:
@@ -490,22 +486,15 @@ def _linearize_images(problem: Problem, state: State) -> tuple[Array, Array, Arr
 def _step_points(problem: Problem, state: State, weight: Array) -> State:
     """One step of Gauss-Newton for all points, with weights (n,) of the images."""
     error, _, J = _linearize_images(problem, state)
-    n, point = len(state.points), problem.background.point
-    H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
-    np.add.at(H, point, weight[:, None, None] * np.swapaxes(J, 1, 2) @ J)
-    np.add.at(g, point, weight[:, None] * (np.swapaxes(J, 1, 2) @ error[:, :, None])[:, :, 0])
-    regular = REGULAR * np.einsum("jii->j", H)[:, None, None] + np.finfo(float).tiny
-    step = np.linalg.solve(H + regular * np.eye(3), g[:, :, None])[:, :, 0]
+    H, g = _point_equations(len(state.points), problem.background.point, error, J, weight)
+    step = np.linalg.solve(H, g[:, :, None])[:, :, 0]
     return replace(state, points=state.points + step)
 
 
 def _nearest_to_rays(problem: Problem, state: State, background: BackgroundPoints) -> Array:
     """(J, 3) the points nearest to their rays, robustly; NaN where these are nearly parallel."""
-    count, C = len(background), len(problem.lenses)
-    rays, known = np.zeros((C, 1, count, 3)), np.zeros((C, 1, count), bool)
+    xy = np.full((len(problem.lenses), 1, len(background), 2), np.nan)
     for c, given in enumerate(problem.lenses):
         rows = background.camera == c
-        ray = state.lens(c, given).rays(background.uv[rows]) @ state.cameras[c, :3, :3].T
-        known[c, 0, background.point[rows]] = np.isfinite(ray).all(axis=1)
-        rays[c, 0, background.point[rows]] = np.nan_to_num(ray)
-    return intersect(rays, state.cameras[:, :3, 3], known)[0][0]
+        xy[c, 0, background.point[rows]] = state.lens(c, given).normalise(background.uv[rows])
+    return intersect_images(xy, state.cameras)[0][0]

@@ -21,7 +21,7 @@ import numpy as np
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, lens_parameters
 from calib.rig.estimation import CHANCE, CLEAR, GROSS, coordinate_sigma
-from calib.rig.triangulation import intersect
+from calib.rig.triangulation import intersect_images
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations
 from calib.wand.bundle_adjustment.residuals import point_jacobians, predict_markers
@@ -255,10 +255,7 @@ def _triangulate_rows(recording: WandRecording, state: State, lens: Lens, camera
         stamp_s = detections.t_s + offset + drift * since
         xy[other] = interpolate(tracks, detections.label, stamp_s, recording.timing.gap_s)
     xy[camera] = lens.normalise(detections.uv)
-    ray = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:2], 1))], axis=2)
-    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-    ray = np.einsum("cij,crj->cri", state.cameras[:, :3, :3], ray)
-    return intersect(ray[:, None], state.cameras[:, :3, 3], np.isfinite(xy[:, None, :, 0]))[0][0]
+    return intersect_images(xy[:, None], state.cameras)[0][0]
 
 
 def _rms(values: Array) -> float:
@@ -400,17 +397,13 @@ def _misfit(recording: WandRecording, state: State, table: Index, order: Index) 
     camera k shows the detections of camera order[k]; relative to the images' longer sides."""
     cameras, lenses = len(order), _adjusted_lenses(recording, state)
     uv = recording.detections.uv
-    known = np.zeros((cameras, 1, len(table)), bool)
-    ray, pixels = np.zeros((cameras, 1, len(table), 3)), np.full((cameras, len(table), 2), np.nan)
+    pixels, xy = np.full((2, cameras, len(table), 2), np.nan)
     for shown in range(cameras):
         of, rows = int(order[shown]), table[:, shown]
         pixels[of] = np.where(rows[:, None] >= 0, uv[rows], np.nan)
-        xy = lenses[of].normalise(np.nan_to_num(pixels[of]))
-        known[of, 0] = (rows >= 0) & np.isfinite(xy).all(axis=1)
-        local = np.column_stack([np.nan_to_num(xy), np.ones(len(xy))])
-        ray[of, 0] = local / np.linalg.norm(local, axis=1, keepdims=True) @ state.cameras[of, :3, :3].T
-    points = intersect(ray, state.cameras[:, :3, 3], known, rounds=1)[0][0]
-    misfit = np.where(np.isfinite(points[:, 0]), 0.0, np.inf)
+        xy[of, rows >= 0] = lenses[of].normalise(pixels[of, rows >= 0])
+    points, _, known = intersect_images(xy[:, None], state.cameras, rounds=1)
+    points, misfit = points[0], np.where(np.isfinite(points[0, :, 0]), 0.0, np.inf)
     for camera, lens in enumerate(lenses):
         seen = known[camera, 0]
         off = _pixel_distances(lens, state.cameras[camera], points[seen], pixels[camera, seen])

@@ -24,7 +24,6 @@ from calib.errors import CalibrationError
 from calib.live.collect import CollectedFrames
 from calib.live.live_session import (
     GONE_S,
-    IDLE_S,
     SessionProgress,
     StoppingRule,
     is_wand_gone,
@@ -175,8 +174,8 @@ def test_the_stopping_rule_needs_all_cameras_precise_and_the_area_used_or_idle()
     assert not StoppingRule().is_met(NOISY, 10.0)
     rule = StoppingRule()
     assert not rule.is_met(SPARSE, 10.0)
-    assert not rule.is_met(SPARSE, 10.0 + IDLE_S)
-    assert rule.is_met(SPARSE, 10.1 + IDLE_S)
+    assert not rule.is_met(SPARSE, 10.0 + GONE_S)
+    assert rule.is_met(SPARSE, 10.1 + GONE_S)
     assert not rule.is_met(INCOMPLETE, 99.0)
 
 

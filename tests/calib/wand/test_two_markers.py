@@ -115,7 +115,7 @@ def test_too_few_detections_are_refused():
     messages = unnumbered(recorded.messages)
     alone = [m for m in messages if (m.t_ns // 1_000_000_000) % 5 == int(m.camera[3:])]
     with pytest.raises(
-        CalibrationError, match="no two cameras could be placed: .* at once in [01] frame sets"
+        CalibrationError, match=r"no two cameras could be placed: .* at once in [01] frame sets"
     ):
         place(recorded, alone)
     with pytest.raises(CalibrationError):
