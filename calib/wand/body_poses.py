@@ -20,13 +20,13 @@ import numpy as np
 
 from calib.rig.camera import FLAT, span_dimension, transform
 from calib.rig.estimation import MARGIN, STEPS
+from calib.rig.triangulation import MIN_MARKERS, solve_view
 from calib.wand.detections import MarkerTrack, WandDetections
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_from_vector, skew
 
-MIN_MARKERS = 4  # of a view, that give the body's pose
 MAX_VIEW = 32  # of a view, that are used to locate it
 SIGMA_RAD = 1.5e-3  # of a ray to a marker by a rough rig: 3 px of a lens of 2000 px
 GATE_RAD = 5 * SIGMA_RAD  # a ray farther from its marker is an outlier
@@ -76,29 +76,6 @@ class PlacedCamera:
 def has_poses(wand: Body) -> bool:
     """Whether the markers give the pose of the body: four or more that are not on a line."""
     return len(wand.markers) >= MIN_MARKERS and span_dimension(wand.points) >= 2
-
-
-def solve_view(points: Array, xy: Array) -> list[Array]:
-    """Poses (4, 4) of a body in a camera, the better one first, from image plane coordinates (n, 2) of its points
-    (n, 3); none where they do not determine it."""
-    if len(points) < MIN_MARKERS or (rank := span_dimension(points)) < 2:
-        return []
-    method, given = cv2.SOLVEPNP_SQPNP, points
-    if rank == 2:  # IPPE needs points that are exactly in a plane
-        off = points - points.mean(axis=0)
-        normal = np.linalg.svd(off)[2][2]
-        method, given = cv2.SOLVEPNP_IPPE, points - np.outer(off @ normal, normal)
-    try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(given, xy, np.eye(3), None, flags=method)
-    except cv2.error:
-        return []
-    found = []
-    for turn, shift in zip(turns, shifts, strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-        if np.isfinite(T).all() and (transform(T, points)[:, 2] > 0).all():
-            found.append(T)
-    return found
 
 
 class BodyLocator:
