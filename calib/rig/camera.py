@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A camera: a lens with a pose and a clock offset, and the Jacobians of its pixels."""
+"""A camera: a lens with a pose and a clock offset, the Jacobians of its pixels, and the pose of a body in one view."""
 
 from collections.abc import Sequence
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,6 +24,7 @@ PER_CAMERA = 18
 # principal point, and distortion coefficients (k1, k2, p1, p2, k3 of a pinhole lens).
 FOCAL_STABILITY, CENTRE_STABILITY, DISTORTION_STABILITY = 5e-4, 0.3, (5e-4, 2e-4, 2e-5, 2e-5, 2e-4)
 
+MIN_MARKERS = 4  # of a view, that give a body's pose
 FLAT = 0.01  # of the extent of points: those nearer to a line or a plane lie on it
 
 
@@ -116,6 +118,29 @@ def span_dimension(points: Array) -> int:
 def transform(T: Array, points: ArrayLike) -> Array:
     """Points (N, 3) moved by the rigid motion T (4, 4)."""
     return np.asarray(points, float).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+
+
+def solve_view(points: Array, xy: Array) -> list[Array]:
+    """Poses (4, 4) of a body in a camera, the better one first, from image plane coordinates (n, 2) of its points
+    (n, 3); none where they do not determine it."""
+    if len(points) < MIN_MARKERS or (rank := span_dimension(points)) < 2:
+        return []
+    method, given = cv2.SOLVEPNP_SQPNP, points
+    if rank == 2:  # IPPE needs points that are exactly in a plane
+        off = points - points.mean(axis=0)
+        normal = np.linalg.svd(off)[2][2]
+        method, given = cv2.SOLVEPNP_IPPE, points - np.outer(off @ normal, normal)
+    try:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(given, xy, np.eye(3), None, flags=method)
+    except cv2.error:
+        return []
+    found = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+        if np.isfinite(T).all() and (transform(T, points)[:, 2] > 0).all():
+            found.append(T)
+    return found
 
 
 def pixel_jacobians(lens: Lens, points: ArrayLike) -> tuple[Array, Array, Array, Array]:

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Triangulates points that several placed cameras see, and predicts the covariance of such points; locates a body of
-known points by one view (PnP)."""
+"""Triangulates points that several placed cameras see, and predicts the covariance of such points."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
-from calib.rig.camera import LENS, OFFSET, POSE, Camera, pixel_jacobians, span_dimension, transform
+from calib.rig.camera import LENS, OFFSET, POSE, Camera, pixel_jacobians, transform
 from calib.rig.camera_errors import PARAMETERS, error_covariance
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
@@ -18,7 +16,6 @@ from camera_node.geometry.pose import invert
 
 Visibility = Callable[[Camera, Array], Mask]
 
-MIN_MARKERS = 4  # of a view, that give a body's pose
 MIN_ANGLE = 0.01  # rad between viewing rays, about: rays that are closer to parallel fix no point
 ITERATIONS, CONVERGED_M = 8, 1e-10
 REWEIGHTINGS = 8  # of many rays at once
@@ -80,29 +77,6 @@ def triangulate_points(cameras: Sequence[Camera], uv: Array) -> Array:
         if not len(moving):
             break
     return p
-
-
-def solve_view(points: Array, xy: Array) -> list[Array]:
-    """Poses (4, 4) of a body in a camera, the better one first, from image plane coordinates (n, 2) of its points
-    (n, 3); none where they do not determine it."""
-    if len(points) < MIN_MARKERS or (rank := span_dimension(points)) < 2:
-        return []
-    method, given = cv2.SOLVEPNP_SQPNP, points
-    if rank == 2:  # IPPE needs points that are exactly in a plane
-        off = points - points.mean(axis=0)
-        normal = np.linalg.svd(off)[2][2]
-        method, given = cv2.SOLVEPNP_IPPE, points - np.outer(off @ normal, normal)
-    try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(given, xy, np.eye(3), None, flags=method)
-    except cv2.error:
-        return []
-    found = []
-    for turn, shift in zip(turns, shifts, strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-        if np.isfinite(T).all() and (transform(T, points)[:, 2] > 0).all():
-            found.append(T)
-    return found
 
 
 def intersect(ray: Array, centre: Array, known: Mask, rounds: int = REWEIGHTINGS) -> tuple[Array, Array]:

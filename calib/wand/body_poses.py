@@ -18,9 +18,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from calib.rig.camera import FLAT, span_dimension, transform
+from calib.rig.camera import FLAT, MIN_MARKERS, solve_view, span_dimension, transform
 from calib.rig.estimation import MARGIN, STEPS
-from calib.rig.triangulation import MIN_MARKERS, solve_view
 from calib.wand.detections import MarkerTrack, WandDetections
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body

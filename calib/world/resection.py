@@ -15,9 +15,8 @@ import msgspec
 import numpy as np
 
 from calib.errors import CalibrationError
-from calib.rig.camera import Camera, pixel_jacobians, span_dimension, transform
+from calib.rig.camera import MIN_MARKERS, Camera, pixel_jacobians, solve_view, span_dimension, transform
 from calib.rig.estimation import MARGIN, STEPS
-from calib.rig.triangulation import MIN_MARKERS, solve_view
 from calib.world.landmarks import FIT_PX
 from calib.world.still_roundels import StillRoundel
 from camera_node.foundation.arrays import Array, Index
