@@ -145,9 +145,11 @@ def text(word: str) -> bytes:
     return struct.pack("<I", len(word)) + word.encode()
 
 
-def hostile(records: bytes, stated: int | None = None, check_sum: int | None = None) -> bytes:
-    """A file whose only chunk states a size, the right one by default."""
-    data = zstandard.compress(records)
+def hostile(
+    records: bytes, stated: int | None = None, check_sum: int | None = None, is_frame_sized: bool = True
+) -> bytes:
+    """A file whose only chunk states a size, the right one by default; its frame states the right one or none."""
+    data = zstandard.ZstdCompressor(write_content_size=is_frame_sized).compress(records)
     stated = len(records) if stated is None else stated
     check_sum = zlib.crc32(records) if check_sum is None else check_sum
     chunk = struct.pack("<QQQI", 0, 1, stated, check_sum) + text("zstd") + struct.pack("<Q", len(data)) + data
@@ -184,10 +186,11 @@ print(n, peak_kb() - before, "|", *faults)
         (lambda: hostile(bytes(EXPANDED)), "chunks of more than"),  # 256 MB in 8 kB
         (lambda: hostile(bytes(EXPANDED), stated=1 << 32), "cut off"),
         (lambda: hostile(bytes(EXPANDED), stated=1 << 20), "cut off"),
+        (lambda: hostile(bytes(EXPANDED), stated=1 << 20, is_frame_sized=False), "cut off"),
         (lambda: hostile(bytes(1 << 20), check_sum=1), "cut off"),
         (lambda: hostile(channel_and_message((1 << 24) + 1)), "messages of more than"),
     ],
-    ids=["chunk", "both", "frame", "check sum", "message"],
+    ids=["chunk", "both", "frame", "frame without a size", "check sum", "message"],
 )
 def test_memory_is_bounded_by_what_a_chunk_may_state(tmp_path: Path, content: Callable[[], bytes], said: str):
     path = tmp_path / "hostile.mcap"
