@@ -581,14 +581,15 @@ def _mirrored(pairs: TwoViewGeometry, k: int) -> TwoViewGeometry:
 
 
 def _find_large_shift(pairs: TwoViewGeometry, k: int, other: int) -> float:
-    """Return the shift by which camera k's timestamps are late, if it makes k fit the other camera; else 0."""
+    """Return the shift by which camera k's timestamps are late, if it makes k fit the other camera; else 0. One within
+    `MAX_SHIFT_S` is no fault: the adjustment finds it."""
     detections = pairs.detections
     seen = detections.select(pairs.rows[other])
     shift_s = find_shift(pairs.tracks[k], seen, pairs.gap_s, UNSYNCHRONIZED_S, UNSYNCHRONIZED_STEP_S)
     t_s = detections.t_s.copy()
     t_s[pairs.rows[k]] -= shift_s
     moved = pairs.with_detections(replace(detections, t_s=t_s))
-    return shift_s if shift_s and _fits(moved, k, other) is not None else 0.0
+    return shift_s if abs(shift_s) > MAX_SHIFT_S and _fits(moved, k, other) is not None else 0.0
 
 
 def explain_unplaced(
@@ -663,8 +664,9 @@ def explain_failure(
     pairs = np.triu(shared, 1)
     a, b = divmod(int(pairs.argmax()), len(pairs))
     frames = ", ".join(f"{name} {n}" for name, n in zip(names, counts, strict=True))
+    remedy = "measure the wand and" if pairs.max() >= MIN_FRAME_SETS else "wave it where views overlap, and"
     return (
         f"no two cameras could be placed: '{names[a]}' and '{names[b]}' saw the wand at once in {pairs.max()} frame "
         f"sets, others in fewer, and {MIN_FRAME_SETS} that fit one wand are needed (frames with the wand: {frames}); "
-        "wave it where views overlap, check the diameter and the markers of the wand file, and the intrinsics"
+        f"{remedy} check the diameter and the markers of the wand file, and the intrinsics"
     )

@@ -30,7 +30,9 @@ def test_a_wand_file_with_a_wrong_spacing_is_refused():
     lengths = [float(length) for length in re.findall(r"(\d\.\d{3}) m", str(caught.value))]
     assert lengths == [0.17, pytest.approx(0.2, abs=0.01)]  # scale and spacing share the error
     far_off = msgspec.structs.replace(WAND, markers=((0.0, 0.0, 0.0), (0.14, 0.0, 0.0), (0.5, 0.0, 0.0)))
-    with pytest.raises(CalibrationError, match=r"'cam\d' and 'cam\d' .* \d+ times.* measure the wand"):
+    with pytest.raises(
+        CalibrationError, match=r"'cam\d' and 'cam\d' .* in \d+ frame sets.* measure the wand"
+    ):
         calibrate(arena.intrinsics, far_off, messages)
 
 
