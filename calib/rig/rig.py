@@ -25,10 +25,8 @@ from camera_node.protocol.messages import MAX_READOUT_US
 T = TypeVar("T")
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")  # the fields that every camera needs
 MAX_CAMERAS = 256
-MAX_IMAGE_PX, MAX_RIG_PX = (
-    64e6,
-    1e9,
-)  # of one image, whose table of the lens takes 3 s and 0.7 GB; of all together
+MAX_IMAGE_PX = 64e6  # of one image: the server computes a table of the lens in 3 s and 0.7 GB
+MAX_RIG_PX = 1e9  # of all images together
 # The largest plausible numbers of a camera: clocks of one session (a day; three times the largest drift that a
 # calibration estimates).
 MOST = {

@@ -72,10 +72,7 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
         Elsewhere positions and normals show it better than a card that a hand has glued on.
         """
-        return (
-            np.linalg.matrix_rank(np.vstack([self.points - self.points[0], self.unit_normals]), tol=LINE_M)
-            < 2
-        )
+        return are_parallel(np.vstack([self.points - self.points[0], self.unit_normals]))
 
     @property
     def card_ratio(self) -> float:
@@ -118,6 +115,11 @@ class Body(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             )
         normals = tuple(_unit(normal) for normal in self.normals)
         msgspec.structs.force_setattr(self, "normals", () if set(normals) <= {UP} else normals)
+
+
+def are_parallel(vectors: Array) -> bool:
+    """Whether vectors (N, 3), metres or unit vectors, are along one line within `LINE_M`."""
+    return bool(np.linalg.matrix_rank(vectors, tol=LINE_M) < 2)
 
 
 class PrintedWand(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -25,7 +25,7 @@ from camera_node.foundation.config import (
     write_atomically,
 )
 from camera_node.foundation.errors import ConfigError, printable
-from camera_node.geometry.body import LINE_M, Body
+from camera_node.geometry.body import Body, are_parallel
 from fusion.errors import FusionError
 from fusion.model.likeness import DISTINCT_M, likeness, sides, symmetry
 
@@ -81,11 +81,7 @@ class Robot(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_de
         self._require_apart()
         if self.is_single and self.normals:
             raise ValueError("a single marker defines the z axis of its robot: leave its normal out")
-        if (
-            len(self.markers) > 1
-            and not self.is_coded
-            and np.linalg.matrix_rank(self.points - self.points[0], tol=LINE_M) < 2
-        ):
+        if len(self.markers) > 1 and not self.is_coded and are_parallel(self.points - self.points[0]):
             raise ValueError(
                 "two markers, or markers on one line, leave the rotation about the line unknown; "
                 "place a third 20 mm or more off the line, or use a single marker"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
-from camera_node.geometry.body import LINE_M
+from camera_node.geometry.body import LINE_M, are_parallel
 from fusion.model.likeness import align, distances
 from fusion.model.observations import CameraArray, DetectionTable
 from fusion.model.robots import Robot
@@ -95,13 +95,13 @@ def _pose(
     """
     numbers, markers = np.array(list(seen), np.intp), list(seen.values())
     body, places = robot.points[numbers], np.array([marker.position for marker in markers])
-    if _are_off_line(body):
+    if not are_parallel(body - body[0]):
         return align(body, places)
     radius, reach_m = robot.diameter_m / 2, float(max(distances(body).max(), LINE_M))
     normals = np.array([start_rotation(cameras, detections, marker, radius)[0][:, 2] for marker in markers])
     body = np.concatenate([body, body + reach_m * robot.unit_normals[numbers]])
     places = np.concatenate([places, places + reach_m * normals])
-    if not _are_off_line(body):
+    if are_parallel(body - body[0]):
         k = max(range(len(markers)), key=lambda k: len(markers[k].detections))
         zero = zero_of(cameras, detections, markers[k], normals[k], radius)
         if not np.isfinite(zero).all():
@@ -109,11 +109,6 @@ def _pose(
         body = np.concatenate([body, [body[k] + reach_m * robot.code_axes[numbers[k]]]])
         places = np.concatenate([places, [markers[k].position + reach_m * zero]])
     return align(body, places)
-
-
-def _are_off_line(points: Array) -> bool:
-    """Whether points (N, 3) are not all on one line."""
-    return bool(np.linalg.matrix_rank(points - points[0], tol=LINE_M) > 1)
 
 
 def read_codes(
@@ -129,6 +124,8 @@ def read_codes(
         normals: (K, 3) of the markers, world frame, NaN where unknown.
     """
     codes, zeros = np.zeros(len(markers), np.intp), np.full((len(markers), 3), np.nan)
+    if not (detections.code >= 0).any():
+        return codes, zeros
     for k, marker in enumerate(markers):
         read = detections.code[marker.detections]
         names = np.unique(read[read >= 0])

@@ -107,7 +107,7 @@ def compare(
 class Crossing:
     """The places of identical robots on Lissajous figures through the arena.
 
-    Each is covered in a part of each period; a neighbour whose cover ends at the same time takes its place meanwhile.
+    Each is covered in a part of each period, together with another one; in the middle of it, the two change places.
     """
 
     rate: Array

@@ -28,6 +28,9 @@ Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 TRIANGLE = Robot(diameter_m=0.12, markers=((0.15, 0.0, 0.0), (-0.13, 0.14, 0.0), (-0.03, -0.14, 0.0)))
 WIDE = Robot(diameter_m=0.12, markers=((-0.13, 0.07, 0.0), (-0.08, -0.18, 0.0), (0.21, 0.10, 0.0)))
 SINGLE = Robot(diameter_m=0.12)
+EQUILATERAL = tuple(
+    (0.15 * np.cos(a), 0.15 * np.sin(a), 0.0) for a in np.radians([0.0, 120.0, 240.0])
+)  # symmetric
 
 
 def ring(

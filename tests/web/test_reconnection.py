@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""An open page survives a restart of the server: nobody reloads it."""
+"""An open page follows a restarted server without being loaded again."""
 
 from contextlib import ExitStack
 from pathlib import Path

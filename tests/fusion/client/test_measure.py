@@ -12,7 +12,7 @@ from fusion.model.likeness import distances
 from fusion.model.robots import Robot, load_robots, require_distinct
 from fusion.protocol.pose_messages import Markers
 from tests.conftest import ROOT
-from tests.fusion.synthetic import SINGLE, TRIANGLE, WIDE, Arena, line, ring
+from tests.fusion.synthetic import EQUILATERAL, SINGLE, TRIANGLE, WIDE, Arena, line, ring
 from tests.fusion.tracks import track
 from tests.fusion.unknown_robot import WIDE_MOTION
 
@@ -21,7 +21,6 @@ CUBE = load_robots(ROOT / "configs" / "robots_cube.yaml")["cube"]
 SIMILAR = Robot(diameter_m=CUBE.diameter_m, markers=TRIANGLE.markers)
 LARGE = Robot(diameter_m=CUBE.diameter_m, markers=((0.3, 0.0, 0.0), (-0.3, 0.1, 0.0), (0.0, -0.4, 0.0)))
 UNKNOWN = np.full((3, 3), np.nan)
-EQUILATERAL = tuple((0.15 * np.cos(a), 0.15 * np.sin(a), 0.0) for a in np.radians([0.0, 120.0, 240.0]))
 
 
 def plain(points: np.ndarray, normals: np.ndarray) -> StationaryMarkers:

@@ -16,11 +16,10 @@ from fusion.protocol.pose_messages import RobotPose
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.fusion.rendered_arena import RenderedArena
-from tests.fusion.synthetic import PERIOD_NS, SINGLE, TRIANGLE, Arena, line, ring
+from tests.fusion.synthetic import EQUILATERAL, PERIOD_NS, SINGLE, TRIANGLE, Arena, line, ring
 
 COUNT = 5
 SINGLES = {name: Robot(diameter_m=0.12, code=code) for name, code in (("a", 7), ("b", 8), ("c", 70))}
-EQUILATERAL = tuple((0.15 * np.cos(a), 0.15 * np.sin(a), 0.0) for a in np.radians([0.0, 120.0, 240.0]))
 FAR = np.array([50.0, 0.0, 0.0])
 
 
