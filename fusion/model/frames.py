@@ -8,11 +8,14 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.detection.roundels import Roundels
-from camera_node.foundation.arrays import Array
+from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
 from fusion.model.undistortion import undistort
 
+# Rows of the columns of detections; `DetectionTable` describes them.
+UV, COV, OUTLINE, XY, SCALE = slice(2), slice(2, 6), slice(6, 9), slice(9, 11), slice(11, 15)
+CODE, ROTATION, ROTATION_SIGMA, DELAY, N_ROWS = *range(15, 19), 19
 MAX_CLOCK_ERROR_S = 0.1  # a stamp with a larger bound has this one; NaN is an unknown bound
 
 
@@ -22,8 +25,7 @@ class CalibratedFrame:
 
     Attributes:
         t_ns: capture time including the calibrated offset of the camera.
-        xy: (2, N) centres of the undistorted outlines; NaN where the lens has no inverse.
-        scale: (2, 2, N) Jacobians of raw pixels with respect to `xy`.
+        columns: (19, N) of a `DetectionTable`, without the errors of cameras and without delays.
         stamp_ns: capture time as the camera published it; 0 without a message.
         sent_ns, received_ns: times of the message; 0 offline.
         exposure_us, detect_us: durations; 0 where unknown.
@@ -34,8 +36,7 @@ class CalibratedFrame:
     camera: str
     t_ns: int
     roundels: Roundels
-    xy: Array
-    scale: Array
+    columns: Array
     stamp_ns: int = 0
     sent_ns: int = 0
     received_ns: int = 0
@@ -68,14 +69,26 @@ class CalibratedFrame:
         cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **timing: Any
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
-        return cls(name, t_ns, roundels, *undistort(lens, roundels), **timing)
+        columns = np.zeros((N_ROWS, len(roundels)))
+        columns[UV], columns[COV] = roundels.uv.T, roundels.cov.reshape(-1, 4).T
+        columns[OUTLINE] = np.vstack([roundels.axes_px.T, roundels.angle_rad])
+        columns[XY], scale = undistort(lens, roundels)
+        columns[SCALE] = scale.reshape(4, -1)
+        # Numbers that files give are no codes.
+        columns[CODE] = np.where(np.isfinite(roundels.id_probability), roundels.id, -1)
+        columns[ROTATION], columns[ROTATION_SIGMA] = roundels.rotation_rad, roundels.rotation_sigma
+        return cls(name, t_ns, roundels, columns, **timing)
+
+    def select(self, rows: Index) -> "CalibratedFrame":
+        """The frame with some of its roundels."""
+        return replace(self, roundels=self.roundels.select(rows), columns=self.columns[:, rows])
 
     def recalibrated(self, old: Camera, new: Camera) -> "CalibratedFrame":
         """The frame by another calibration of its camera."""
         stamp_ns = self.stamp_ns or self.t_ns
         before_ns, after_ns = (camera.capture_ns(stamp_ns, self.sent_ns) for camera in (old, new))
-        xy, scale = undistort(new, self.roundels)
-        return replace(self, t_ns=self.t_ns + after_ns - before_ns, xy=xy, scale=scale)
+        columns = self.measure(self.camera, 0, self.roundels, new).columns
+        return replace(self, t_ns=self.t_ns + after_ns - before_ns, columns=columns)
 
     def delays(self, lens: Lens) -> Array:
         """(N,) times from `t_ns` to the capture of each roundel's row, seconds."""

@@ -15,14 +15,25 @@ from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
 from calib.rig.camera_errors import error_covariance, image_errors
-from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.foundation.columns import Columns
 from camera_node.geometry.outline import half_axes_of
 from fusion import _core
 from fusion._core import SLACK_PX
 from fusion.model.corrections import with_errors_of
-from fusion.model.frames import FrameSet
+from fusion.model.frames import (
+    CODE,
+    COV,
+    DELAY,
+    N_ROWS,
+    OUTLINE,
+    ROTATION,
+    ROTATION_SIGMA,
+    SCALE,
+    UV,
+    XY,
+    FrameSet,
+)
 from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.model.undistortion import table_of
@@ -181,13 +192,7 @@ class DetectionTable(Columns):
     Attributes:
         exposures: the frames of the set.
         frame: (N,) row of the exposures.
-        delay: (N,) time from the frame to the capture of the detection's row by a rolling shutter, seconds.
-        uv, cov: (2, N) raw pixels and (2, 2, N) their covariances, pixels^2.
-        axes_px, angle_rad: (2, N) full axes and (N,) direction of the major axis of the outline, NaN where unknown.
-        xy: (2, N) undistorted; NaN where the lens has no inverse.
-        scale: (2, 2, N) Jacobians of raw pixels with respect to xy.
-        code: (N,) of the roundel, where it was read; otherwise -1.
-        rotation, rotation_sigma: (N,) of the code, see `Roundels`; NaN where unknown.
+        columns: (19, N) everything else, by rows; the properties are views of it.
     """
 
     ROW_AXIS: ClassVar[int] = -1
@@ -195,16 +200,63 @@ class DetectionTable(Columns):
 
     exposures: Exposures
     frame: Index
-    delay: Array
-    uv: Array
-    cov: Array
-    axes_px: Array
-    angle_rad: Array
-    xy: Array
-    scale: Array
-    code: NDArray[np.int32]
-    rotation: Array
-    rotation_sigma: Array
+    columns: Array
+
+    @property
+    def uv(self) -> Array:
+        """(2, N) raw pixels."""
+        return self.columns[UV]
+
+    @property
+    def cov(self) -> Array:
+        """(2, 2, N) covariances of `uv`, pixels^2."""
+        return self.columns[COV].reshape(2, 2, -1)
+
+    @property
+    def axes_px(self) -> Array:
+        """(2, N) full axes of the outline, NaN where unknown."""
+        return self.columns[OUTLINE][:2]
+
+    @property
+    def angle_rad(self) -> Array:
+        """(N,) direction of the major axis of the outline, NaN where unknown."""
+        return self.columns[OUTLINE][2]
+
+    @property
+    def xy(self) -> Array:
+        """(2, N) centre of the undistorted outline; NaN where the lens has no inverse."""
+        return self.columns[XY]
+
+    @property
+    def scale(self) -> Array:
+        """(2, 2, N) Jacobians of raw pixels with respect to `xy`."""
+        return self.columns[SCALE].reshape(2, 2, -1)
+
+    @property
+    def code(self) -> NDArray[np.int32]:
+        """(N,) of the roundel, where it was read; otherwise -1."""
+        return self.columns[CODE].astype(np.int32)
+
+    @property
+    def rotation(self) -> Array:
+        """(N,) of the code, see `Roundels`; NaN where unknown."""
+        return self.columns[ROTATION]
+
+    @property
+    def rotation_sigma(self) -> Array:
+        """(N,) of the rotation; NaN where unknown."""
+        return self.columns[ROTATION_SIGMA]
+
+    @property
+    def delay(self) -> Array:
+        """(N,) time from the frame to the capture of the detection's row by a rolling shutter, seconds."""
+        return self.columns[DELAY]
+
+    def replaced(self, rows: slice, values: Array) -> "DetectionTable":
+        """The same with other values in these rows of `columns`."""
+        columns = self.columns.copy()
+        columns[rows] = values.reshape(columns[rows].shape)
+        return replace(self, columns=columns)
 
     def may_be(self, rows: Index, codes: Index) -> Mask:
         """(K,) whether detections (rows) may be markers with these codes: all that have no name, or that one.
@@ -230,7 +282,7 @@ class DetectionTable(Columns):
         return self.exposures.tau[self.frame] + self.delay
 
     @property
-    def columns(self) -> _core.DetectionColumns:
+    def native(self) -> _core.DetectionColumns:
         """The arrays for the native core."""
         return _core.DetectionColumns(self.frame, self.xy, self.scale, self.cov, self.axes_px[0], self.delay)
 
@@ -255,37 +307,18 @@ class DetectionTable(Columns):
             np.array([frame.clock_sigma_s for frame in frames]),
             np.array([frame.readout_s / cameras[frame.camera].height for frame in frames]),
         )
-        row = np.repeat(np.arange(len(frames)), [len(frame.roundels) for frame in frames])
-        cov = _concatenate([f.roundels.cov.transpose(1, 2, 0) for f in frames], (2, 2, 0))
-        cov[[0, 1], [0, 1]] += cameras.error_px[exposures.camera[row]] ** 2
-        return cls(
-            exposures,
-            row,
-            _concatenate([f.delays(cameras[f.camera]) for f in frames], (0,)),
-            _concatenate([f.roundels.uv.T for f in frames], (2, 0)),
-            cov,
-            _concatenate([f.roundels.axes_px.T for f in frames], (2, 0)),
-            _concatenate([f.roundels.angle_rad for f in frames], (0,)),
-            _concatenate([f.xy for f in frames], (2, 0)),
-            _concatenate([f.scale for f in frames], (2, 2, 0)),
-            np.concatenate([np.empty(0, np.int32), *(_codes(f.roundels) for f in frames)]),
-            _concatenate([f.roundels.rotation_rad for f in frames], (0,)),
-            _concatenate([f.roundels.rotation_sigma for f in frames], (0,)),
-        )
+        counts = [frame.columns.shape[1] for frame in frames]
+        row = np.repeat(np.arange(len(frames)), counts)
+        columns = np.concatenate([np.empty((N_ROWS, 0)), *(frame.columns for frame in frames)], axis=1)
+        columns[COV][[0, 3]] += cameras.error_px[exposures.camera[row]] ** 2
+        if exposures.line_s.any():
+            columns[DELAY] = np.concatenate([frame.delays(cameras[frame.camera]) for frame in frames])
+        return cls(exposures, row, columns)
 
 
 def _zeros(robot: Robot) -> Array:
     """(3, M) see `MarkerTable`."""
     return robot.code_axes.T if robot.needs_headings else np.full((3, len(robot.markers)), np.nan)
-
-
-def _codes(roundels: Roundels) -> NDArray[np.int32]:
-    """(N,) codes that were read, -1 without; numbers that files give are none."""
-    return np.where(np.isfinite(roundels.id_probability), roundels.id, -1).astype(np.int32)
-
-
-def _concatenate(columns: list[Array], empty: tuple[int, ...]) -> Array:
-    return np.concatenate([np.zeros(empty), *columns], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

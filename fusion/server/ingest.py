@@ -176,6 +176,4 @@ def _with_strongest(frame: CalibratedFrame) -> CalibratedFrame:
     """The frame with the `MAX_DETECTIONS` detections of the highest contrast; those of textures have a low one."""
     contrast = np.nan_to_num(frame.roundels.contrast, nan=-np.inf, posinf=-np.inf)
     rows = np.sort(np.argpartition(-contrast, MAX_DETECTIONS)[:MAX_DETECTIONS])
-    return replace(
-        frame, roundels=frame.roundels.select(rows), xy=frame.xy[:, rows], scale=frame.scale[:, :, rows]
-    )
+    return frame.select(rows)

@@ -141,7 +141,7 @@ class Association:
         exposures = detections.exposures
         poses = self.cameras.frame_poses(self.states, exposures)
         focal = self.cameras.focal[exposures.camera]
-        pairs, cost = self.expected.candidates(poses, detections.columns, focal)
+        pairs, cost = self.expected.candidates(poses, detections.native, focal)
         possible = detections.may_be(pairs[1], self.marker_table.code[self.markers[pairs[0]]])
         pairs, cost = pairs[:, possible], cost[possible]
         marker, detection = pairs[:, assign(pairs, cost, detections.frame)]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
+from fusion.model.frames import COV, OUTLINE
 from fusion.model.observations import CameraArray, MatchedObservations
 from fusion.model.states import States, Transition, predict, reset_unobservable
 from fusion.tracking.gating import AXIS_SIGMA_PX
@@ -278,7 +279,7 @@ class Estimator:
         B = np.tile(np.eye(2), (len(seen), 1, 1))
         B[:, :, 1] -= (self._image_velocity(states, observations) * line_s).T
         axes_px, angle_rad = _sheared(seen.axes_px, seen.angle_rad, B)
-        return replace(observations, detections=replace(seen, axes_px=axes_px, angle_rad=angle_rad))
+        return replace(observations, detections=seen.replaced(OUTLINE, np.vstack([axes_px, angle_rad])))
 
     def _inflate_late(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """Add to the noise of late detections the motion that the constant velocities do not predict.
@@ -296,7 +297,7 @@ class Estimator:
         z = self.cameras.views(states, detections.exposures, discs).centre[2]
         scale = detections.scale
         moved = np.einsum("ian,jan->ijn", scale, scale) * ((q + q_angular * arm2) * late**3 / 3 / z**2)
-        return MatchedObservations.of_discs(replace(detections, cov=detections.cov + moved), discs)
+        return MatchedObservations.of_discs(detections.replaced(COV, detections.cov + moved), discs)
 
     def _inflate_by_clock(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """Add the motion during the standard deviation of the capture time: n sigma_t^2 u u^T, u the image velocity.
@@ -312,7 +313,7 @@ class Estimator:
         sigma = exposures.tau_sigma[discs.frame] * np.sqrt(np.bincount(view)[view])
         shift = velocity * sigma
         cov = detections.cov + shift[:, None] * shift
-        return MatchedObservations.of_discs(replace(detections, cov=cov), discs)
+        return MatchedObservations.of_discs(detections.replaced(COV, cov), discs)
 
 
 def _sheared(axes_px: Array, angle_rad: Array, B: Array) -> tuple[Array, Array]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
+from fusion.model.frames import COV
 from fusion.model.observations import (
     Assignments,
     DetectionTable,
@@ -166,7 +167,7 @@ class RobustUpdate:
     def noisy(self, detections: DetectionTable) -> DetectionTable:
         """Detections with the noise that the last update gave them."""
         cov = detections.cov + self.added_px2 * np.eye(2)[:, :, None]
-        return replace(detections, cov=cov) if self.added_px2 else detections
+        return detections.replaced(COV, cov) if self.added_px2 else detections
 
     def _without_incompatible(self, fitted: RobustFit) -> RobustFit:
         """The fit to detections that do not contradict the others of their robots; all keep their residuals.

@@ -81,7 +81,7 @@ def _detected(
     exposures = detections.exposures
     expected = markers.expected(rows, state, np.zeros(len(rows), np.intp))
     poses, focal = cameras.frame_poses(state, exposures), cameras.focal[exposures.camera]
-    pairs, cost = expected.candidates(poses, detections.columns, focal)
+    pairs, cost = expected.candidates(poses, detections.native, focal)
     possible = detections.may_be(pairs[1], markers.code[rows[pairs[0]]])
     pairs, cost = pairs[:, possible], cost[possible]
     marker, detection = pairs[:, assign(pairs, cost, detections.frame)]

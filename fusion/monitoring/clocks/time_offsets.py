@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from fusion.model.frames import COV
 from fusion.model.observations import CameraArray, MatchedObservations
 from fusion.model.states import POSITION, THETA, States
 
@@ -250,7 +251,7 @@ def _equations(
     """Whitened derivatives by `FREE` (N, 2, 9) and by the time (N, 2), and residuals (N, 2); zero if not visible."""
     discs, seen = observations.discs, observations.detections
     cov = seen.cov + SLACK_PX**2 * np.eye(2)[:, :, None]
-    whiten = MatchedObservations.of_discs(replace(seen, cov=cov), discs).whiten
+    whiten = MatchedObservations.of_discs(seen.replaced(COV, cov), discs).whiten
     poses = cameras.frame_poses(states, seen.exposures)
     rows = poses.linearize_centres(discs.columns, seen.xy, whiten, single)
     spin = np.einsum("nji,nj->ni", states.R, states.omega)[discs.body]  # body frame

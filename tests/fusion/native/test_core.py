@@ -160,7 +160,7 @@ def test_candidates_are_the_pairs_within_the_gates(spread):
     expected = _core.ExpectedMarkers(states.R, states.P, of.body, of.position, of.normal, of.radius)
     poses = ARRAY.frame_poses(states, exposures)
     (marker, sighting), cost = expected.candidates(
-        poses, seen.detections.columns, ARRAY.focal[exposures.camera]
+        poses, seen.detections.native, ARRAY.focal[exposures.camera]
     )
     found = {}
     for f, tau in enumerate(exposures.tau):

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
-from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.frames import N_ROWS, CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.server.frame_synchronizer import SILENT_NS, FrameSynchronizer
 
@@ -21,7 +21,7 @@ Arrivals = list[tuple[int, CalibratedFrame]]
 
 
 def frame(camera: str, t_ns: int) -> CalibratedFrame:
-    return CalibratedFrame(camera, START + t_ns, NOTHING, np.empty((2, 0)), np.empty((2, 2, 0)))
+    return CalibratedFrame(camera, START + t_ns, NOTHING, np.empty((N_ROWS, 0)))
 
 
 def frames_of(camera: str, n: int, phase: float = 0.0, delay: int = 0, period: int = PERIOD) -> Arrivals:

@@ -215,7 +215,7 @@ def test_only_prints_that_face_a_camera_are_candidates():
     frame_set = FrameSet(0, (CalibratedFrame.measure("cam0", 0, roundels, camera),))
     detections = DetectionTable.of(frame_set, cameras)
     pairs, _ = table.expected(rows, states).candidates(
-        cameras.frame_poses(states, exposures), detections.columns, cameras.focal[[0]]
+        cameras.frame_poses(states, exposures), detections.native, cameras.focal[[0]]
     )
     found = set(pairs[0, pairs[0] == pairs[1]].tolist())
     assert found == set(np.flatnonzero(views.facing > 0.1).tolist())
