@@ -2,12 +2,16 @@
 """Measures codes: `python -m tests.benchmarks.codes`.
 
 Of cards in pictures: shares of certain names, wrong names, headings, false names. Of 60 identical robots that cross,
-are covered and exchanged (`--part robots`): poses of another robot, and those that are missing.
+are covered and exchanged (`--part robots`): poses of another robot, and those that are missing. Of one roundel
+(`--part reading`): microseconds of a read.
 """
 
+import subprocess
+import tempfile
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -29,7 +33,9 @@ from tests.benchmarks.detector.photographs import photographs
 from tests.benchmarks.detector.pictures import Card, grid, missed, paste, rotation_of
 from tests.benchmarks.detector.recall import SIZE, ground
 from tests.benchmarks.detector.table import table
+from tests.conftest import ROOT
 from tests.fusion.synthetic import PERIOD_NS, Arena, ring
+from tests.native import build
 
 CELLS = {0: (11, 12, 14, 16, 20), 45: (12, 14, 16, 20), 60: (14, 16, 20, 24)}  # diameters by tilt, degrees
 FRAMES = (1, 10)
@@ -39,6 +45,7 @@ UNSEEN, UNREAD = 0.1, 0.2  # shares of the views that are not detected, and of t
 HIDDEN_S, PERIOD_S = 0.5, 2.0  # how long a robot is covered, and how often
 WRONG_M = 0.05  # of a pose of another robot
 WITHIN_S = 0.2  # goal of the acquisition after two cameras see a robot
+FAST = ("-O3", "-UROUNDEL_SCALAR")  # as the module is compiled
 NEAR = 0.2  # distance from the true centre at which a card counts as found, diameters
 
 
@@ -182,6 +189,16 @@ def _partly_read(roundels: Roundels, rng: np.random.Generator) -> Roundels:
     return replace(roundels, id=np.where(unread, -1, roundels.id).astype(np.int32), **unknown)
 
 
+def reading_times() -> list[tuple[str, ...]]:
+    """Microseconds in which one code is read, by diameter and kind of roundel."""
+    driver = Path(__file__).with_name("code_reading.cpp")
+    with tempfile.TemporaryDirectory() as folder:
+        native = ROOT / "camera_node" / "native"
+        program = build(native, driver, Path(folder), ("code_book", "code_reader"), FAST)
+        done = subprocess.run([program], capture_output=True, check=True, text=True, timeout=60)
+    return [tuple(line.split()) for line in done.stdout.splitlines()]
+
+
 @dataclass(frozen=True)
 class Benchmark:
     """Measure codes on clutter, by tilt, diameter and number of frames, and false names without codes."""
@@ -192,7 +209,7 @@ class Benchmark:
     """Cards of a cell, 48 in a picture."""
     pictures: int = 200
     """Pictures without codes of each kind."""
-    part: Literal["pictures", "robots"] | None = None
+    part: Literal["pictures", "robots", "reading"] | None = None
     """Of the benchmark; all without it."""
     seconds: float = 8.0
     """Of the robots that cross."""
@@ -200,9 +217,12 @@ class Benchmark:
     def run(self) -> None:
         """Print the tables."""
         console = Console(width=120)
-        if self.part != "robots":
+        if self.part in (None, "pictures"):
             self._read_pictures(console)
-        if self.part != "pictures":
+        if self.part in (None, "reading"):
+            headings = ("diameter, px", "coded", "plain", "plain, on tiles")
+            console.print(table("microseconds of a read", headings, reading_times()))
+        if self.part in (None, "robots"):
             headings = ("robots seen for 0.2 s", "% tracked", "poses of another", "missing")
             console.print(table("60 identical robots", headings, [crossing_robots(self.seconds)]))
 

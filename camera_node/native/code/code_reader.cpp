@@ -4,198 +4,262 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstring>
 #include <numbers>
+#include <utility>
 
 #include "numeric/cholesky.hpp"
+#include "numeric/lanes.hpp"
+#include "numeric/simd.hpp"
 
 namespace roundel {
 
 namespace {
 
 constexpr double kTau = 2 * std::numbers::pi;
-constexpr int kFinest = 16;                       // samples of a sector, at most
-constexpr int kSamples = kCodeSectors * kFinest;  // of the ring, at most
-constexpr int kHalf = kCodeSectors / 2;           // sectors whose costs one table adds up
+constexpr int kFinest = 16;                                    // samples of a sector, at most
+constexpr int kPadded = (kCodeSectors / kLanes + 1) * kLanes;  // sectors in whole lanes
 constexpr double kMiddle = (kCodeInner + kCodeOuter) / 2;
 constexpr double kMaxError = 1e-6;          // probability of a wrong name that counts as certain
 constexpr double kCovered = 0.02;           // prior probability that something covers a sector
 constexpr double kChanged = 1e-3;           // and that a track has become another roundel's
 constexpr double kModelError = 0.1;         // of a sector's level, contrasts
 constexpr double kRemembered = 10;          // frames of a mean: errors of fits differ from frame to frame
-constexpr double kNegligible = -40;         // log-likelihoods that add less than 1e-15 to 1
+constexpr float kImpossible = -1e9f;        // a log-likelihood
 constexpr double kInterpolation = 1 / 6.0;  // variance that bilinear interpolation adds to blur, px^2
 
-/// The directions of all half samples, counter-clockwise as seen in front of the print.
+/// Directions counter-clockwise as seen in front of the print: those of the sectors' starts, and turns by
+/// half samples of the finest ring.
 struct Directions {
-    std::array<double, 2 * kSamples> x, y;
+    float x[kPadded], y[kPadded];
+    float cos[2 * kFinest], sin[2 * kFinest];
     Directions() {
-        for (size_t k = 0; k < x.size(); ++k) {
-            x[k] = std::cos(kTau / 2 * double(k) / kSamples);
-            y[k] = -std::sin(kTau / 2 * double(k) / kSamples);
+        for (int k = 0; k < kPadded; ++k) {
+            x[k] = float(std::cos(kTau * k / kCodeSectors));
+            y[k] = float(-std::sin(kTau * k / kCodeSectors));
         }
+        for (int k = 0; k < 2 * kFinest; ++k) {
+            cos[k] = float(std::cos(kTau * k / (2 * kFinest * kCodeSectors)));
+            sin[k] = float(std::sin(kTau * k / (2 * kFinest * kCodeSectors)));
+        }
+    }
+    std::pair<float, float> at(int k, int turn) const {
+        return {cos[turn] * x[k] + sin[turn] * y[k], cos[turn] * y[k] - sin[turn] * x[k]};
+    }
+    /// Those of the sectors from `k` on after a turn.
+    ROUNDEL_INLINE void at(int k, int turn, Lanes& to_x, Lanes& to_y) const {
+        to_x = cos[turn] * load(x + k) + sin[turn] * load(y + k);
+        to_y = cos[turn] * load(y + k) - sin[turn] * load(x + k);
+    }
+};
+const Directions kAround;
+
+/// A number for each sector, NaN in the lanes beyond the last one.
+struct alignas(4 * kLanes) Sectorwise {
+    float at[kPadded];
+};
+
+/// The ring of a code as a profile of blackness: 0 for paper, 1 for ink, at samples of its middle.
+struct Profile {
+    int per_sector;  // samples
+    /// Row j has the j-th sample of each sector, row j + per_sector that of the sector after it; NaN outside
+    /// of the image.
+    Sectorwise rows[2 * kFinest];
+    Sectorwise gains;  // blackness per contrast
+    /// The sum from the middle of a sector to that of the next one; sectors begin at a sample.
+    double between(int sector, int start) const {
+        const int first = start + per_sector / 2, column = (sector + first / per_sector) % kCodeSectors;
+        const Sectorwise* row = rows + first % per_sector;
+        float sum = 0;
+        for (int j = 0; j < per_sector; ++j) sum += row[j].at[column];
+        return double(sum);
     }
 };
 
-/// All words at all turns: turn t of code n is at n kCodeSectors + t.
-const std::vector<Word>& turned_words() {
-    static const std::vector<Word> all = [] {
-        std::vector<Word> words;
-        for (const Word word : code_words())
-            for (int turn = 0; turn < kCodeSectors; ++turn) words.push_back(turned(word, turn));
-        return words;
-    }();
-    return all;
+/// The bilinearly interpolated grey levels; NaN outside of the image.
+ROUNDEL_INLINE Lanes levels_at(const ImageView& image, const Lanes& x, const Lanes& y) {
+    const Bits inside =
+        (x >= 0.0f) & (y >= 0.0f) & (x < float(image.width - 1)) & (y < float(image.height - 1));
+    const Lanes safe_x = inside ? x : all(0), safe_y = inside ? y : all(0);
+    const Bits u = __builtin_convertvector(safe_x, Bits), v = __builtin_convertvector(safe_y, Bits);
+    Words pixels{};  // a byte each: two of a row, two of the next one
+    for (int k = 0; k < kLanes; ++k) {
+        const uint8_t* at = image.row(v[k]) + u[k];
+        uint16_t upper, lower;
+        std::memcpy(&upper, at, sizeof upper);
+        std::memcpy(&lower, at + image.stride, sizeof lower);
+        pixels[k] = uint32_t(upper) | uint32_t(lower) << 16;
+    }
+    Lanes levels[4];
+    for (int k = 0; k < 4; ++k) levels[k] = __builtin_convertvector(Bits(pixels >> (8 * k) & 255), Lanes);
+    const Lanes a = safe_x - __builtin_convertvector(u, Lanes),
+                b = safe_y - __builtin_convertvector(v, Lanes);
+    const Lanes above = levels[0] + a * (levels[1] - levels[0]);
+    const Lanes below = levels[2] + a * (levels[3] - levels[2]);
+    return inside ? above + b * (below - above) : all(NAN);
 }
-
-/// The grey level at a point; NaN outside of the image.
-double level_at(const ImageView& image, double x, double y) {
-    if (!(x >= 0 && y >= 0 && x < image.width - 1 && y < image.height - 1)) return NAN;
-    const int u = int(x), v = int(y);
-    const double a = x - u, b = y - v;
-    const uint8_t *upper = image.row(v) + u, *lower = image.row(v + 1) + u;
-    return (1 - b) * ((1 - a) * upper[0] + a * upper[1]) + b * ((1 - a) * lower[0] + a * lower[1]);
-}
-
-/// The ring of a code as a profile of blackness: 0 for paper, 1 for ink, at each sample of its middle.
-struct Profile {
-    int per_sector;                          // samples
-    std::array<double, kSamples> black;      // NaN outside of the image
-    std::array<double, kCodeSectors> gains;  // blackness per contrast, about each sector
-    size_t size() const { return size_t(per_sector) * kCodeSectors; }
-};
 
 /// Samples about a pixel apart. Blur mixes ink with the paper on both sides of the ring, by an amount that
 /// follows from the width of the ring's picture there.
-Profile sample_ring(const ImageView& image, const Parameters& p) {
-    static const Directions directions;
-    const double radius = std::sqrt(std::abs(p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy]));
-    const double pixels = kTau * kMiddle * radius / kCodeSectors;
-    Profile profile;
-    profile.per_sector = pixels < 6 ? 4 : pixels < 12 ? 8 : kFinest;
-    const size_t step = size_t(kFinest / profile.per_sector);
-    const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy], contrast = p[kBright] - p[kDark];
-    const double spread = std::sqrt(2 * (p[kBlur] * p[kBlur] + kInterpolation));
-    for (size_t k = 0; k < kCodeSectors; ++k) {
-        const double x = directions.x[(2 * k + 1) * kFinest], y = directions.y[(2 * k + 1) * kFinest];
-        const double per_pixel =
-            std::hypot(p[kAyy] * x - p[kAxy] * y, p[kAxx] * y - p[kAxy] * x) / std::abs(det);
-        profile.gains[k] = 1 / std::erf((kCodeOuter - kCodeInner) / 2 / per_pixel / spread);
+ROUNDEL_CLONES void sample_ring(const ImageView& image, const Parameters& p, Profile& to) {
+    const double det = std::abs(p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy]);
+    const double pixels = kTau * kMiddle * std::sqrt(det) / kCodeSectors;
+    const int m = to.per_sector = pixels < 6 ? 4 : pixels < 12 ? 8 : kFinest;
+    const auto x0 = float(p[kX]), y0 = float(p[kY]), gx = float(p[kGx]), gy = float(p[kGy]);
+    const auto xx = float(p[kAxx]), xy = float(p[kAxy]), yy = float(p[kAyy]);
+    const auto bright = float(p[kBright]), per_contrast = float(1 / (p[kBright] - p[kDark]));
+    const auto half_width = float((kCodeOuter - kCodeInner) / 2 * det /
+                                  std::sqrt(p[kBlur] * p[kBlur] + kInterpolation));  // over the blur
+    constexpr auto kRadius = float(kMiddle);
+    for (int k = 0; k < kPadded; k += kLanes) {
+        Lanes x, y;
+        kAround.at(k, kFinest, x, y);
+        const Lanes nx = yy * x - xy * y, ny = xx * y - xy * x;
+        const Lanes gain =
+            1.0f / (1.0f - 2.0f * normal_tail(half_width * inverse_sqrt(nx * nx + ny * ny)).tail);
+        store(to.gains.at + k, gain);
+        for (int j = 0; j < m; ++j) {
+            kAround.at(k, (2 * j + 1) * (kFinest / m), x, y);
+            const Lanes scale = kRadius / (1.0f + kRadius * (gx * x + gy * y));
+            const Lanes level =
+                levels_at(image, x0 + scale * (xx * x + xy * y), y0 + scale * (xy * x + yy * y));
+            store(to.rows[j].at + k, (bright - level) * (per_contrast * gain));
+        }
     }
-    for (size_t k = 0; k < profile.size(); ++k) {
-        const double x = directions.x[(2 * k + 1) * step], y = directions.y[(2 * k + 1) * step];
-        const double scale = kMiddle / (1 + kMiddle * (p[kGx] * x + p[kGy] * y));
-        const double u = p[kAxx] * x + p[kAxy] * y, v = p[kAxy] * x + p[kAyy] * y;
-        const double level = level_at(image, p[kX] + scale * u, p[kY] + scale * v);
-        profile.black[k] = (p[kBright] - level) / contrast * profile.gains[k / size_t(profile.per_sector)];
+    for (int j = 0; j < m; ++j) {
+        float *row = to.rows[j].at, *next = to.rows[j + m].at;
+        std::fill(row + kCodeSectors, row + kPadded, NAN);
+        std::copy(row + 1, row + kPadded, next);
+        next[kCodeSectors - 1] = row[0];
+        next[kPadded - 1] = NAN;
     }
-    return profile;
 }
 
-/// The blackness of the middle halves of the sectors that begin at a sample.
+/// The sums of the middle halves of the sectors that begin at a sample.
 struct SectorLevels {
     int start;
-    std::array<double, kCodeSectors> black;
+    Sectorwise black;
 };
 
 /// Sectors at the start that separates ink from paper best.
-SectorLevels find_sectors(const Profile& profile) {
-    SectorLevels best{};
-    double most = -1;
-    const int m = profile.per_sector, n = int(profile.size());
+ROUNDEL_CLONES void find_sectors(const Profile& profile, SectorLevels& best) {
+    const int m = profile.per_sector;
+    float most = -1;
     for (int start = 0; start < m; ++start) {
-        SectorLevels at{start, {}};
-        double apart = 0;
-        for (int k = 0; k < kCodeSectors; ++k) {
-            double black = 0;
-            for (int j = m / 4; j < m - m / 4; ++j) black += profile.black[size_t((start + k * m + j) % n)];
-            at.black[size_t(k)] = black / (m / 2);
-            if (std::isfinite(black)) apart += square(std::clamp(at.black[size_t(k)], 0.0, 1.0) - 0.5);
+        SectorLevels now{start, {}};
+        Lanes apart{};
+        for (int k = 0; k < kPadded; k += kLanes) {
+            Lanes black{};
+            for (int j = start + m / 4; j < start + m - m / 4; ++j) black += load(profile.rows[j].at + k);
+            store(now.black.at + k, black);
+            const Lanes off = clamped(black, all(0), all(float(m) / 2)) - float(m) / 4;
+            apart += black == black ? off * off : all(0);
         }
-        if (apart > most) {
-            most = apart;
-            best = at;
+        if (const float squares = sum(apart); squares > most) {
+            most = squares;
+            best = now;
         }
     }
-    return best;
 }
 
-/// Sums of costs over the sectors of all parts of words of `kHalf` bits.
-using Table = std::array<float, size_t(1) << kHalf>;
-
-Table add_up(const float* white, const float* black) {
-    Table table;
-    table[0] = 0;
-    for (size_t k = 0, n = 1; k < size_t(kHalf); ++k, n *= 2)
-        for (size_t part = 0; part < n; ++part) {
-            table[n + part] = table[part] + black[k];
-            table[part] += white[k];
-        }
-    return table;
-}
-
-/// Log-likelihoods of a frame: of no code, and of any word by those of its halves.
-struct FrameScores {
-    float none = 0;
-    Table low, high;
-    float of(Word word) const { return low[word & (low.size() - 1)] + high[word >> kHalf]; }
-    /// Of a code at its best turn.
-    float of_code(size_t code) const {
-        const Word* words = turned_words().data() + (code - 1) * kCodeSectors;
-        float best = of(words[0]);
-        for (int turn = 1; turn < kCodeSectors; ++turn) best = std::max(best, of(words[turn]));
-        return best;
-    }
-    int turn_of(size_t code) const {
-        const Word* words = turned_words().data() + (code - 1) * kCodeSectors;
-        return int(
-            std::max_element(words, words + kCodeSectors, [&](Word a, Word b) { return of(a) < of(b); }) -
-            words);
-    }
+/// Log-likelihoods of a frame's sectors over that of no code.
+struct SectorScores {
+    float most;                           // of any word
+    float white;                          // of a white ring
+    float black[kCodeSectors + kPadded];  // what each sector adds if it is black, twice around
 };
 
-FrameScores score(const SectorLevels& sectors, const std::array<double, kCodeSectors>& gains, double noise) {
-    std::array<float, kCodeSectors> white{}, black{};
-    FrameScores frame;
-    for (size_t k = 0; k < kCodeSectors; ++k) {
-        if (!std::isfinite(sectors.black[k])) continue;
-        const double variance = square(gains[k]) * (square(noise) + square(kModelError));
-        const double peak = (1 - kCovered) / std::sqrt(kTau * variance);
-        const double any = 1 / (2 * gains[k]);  // levels within half a contrast of ink and paper
-        const auto log_likelihood = [&](double due) {
-            const double error = square(sectors.black[k] - due) / variance;
-            return float(std::log(peak * std::exp(-error / 2) + kCovered * any));
+/// `sigma` is that of a level, contrasts. Without a code, all levels within half a contrast of ink and paper
+/// are alike.
+ROUNDEL_CLONES void score(const Profile& profile, const SectorLevels& sectors, double sigma,
+                          SectorScores& to) {
+    const auto due = float(std::log((1 - kCovered) * 2 / (std::sqrt(kTau) * sigma)));
+    const auto covered = float(std::log(kCovered)), per_sigma = float(1 / sigma);
+    Lanes white_ring{}, most{};
+    for (int k = 0; k < kPadded; k += kLanes) {
+        const Lanes per_gain = per_sigma / load(profile.gains.at + k);
+        const Lanes level = load(sectors.black.at + k) / (float(profile.per_sector) / 2);
+        const auto log_likelihood = [&](float expected) __attribute__((always_inline)) {
+            const Lanes off = (level - expected) * per_gain, agreeing = due - 0.5f * off * off;
+            return level == level ? log_sum(agreeing, all(covered)) : all(0);
         };
-        white[k] = log_likelihood(0);
-        black[k] = log_likelihood(1);
-        frame.none += float(std::log(any));
+        const Lanes white = log_likelihood(0), black = log_likelihood(1);
+        store(to.black + k, black - white);
+        white_ring += white;
+        most += greater(white, black);
     }
-    frame.low = add_up(white.data(), black.data());
-    frame.high = add_up(white.data() + kHalf, black.data() + kHalf);
-    return frame;
+    to.most = sum(most);
+    to.white = sum(white_ring);
+    for (int k = kCodeSectors; k < kCodeSectors + kPadded; ++k) to.black[k] = to.black[k - kCodeSectors];
 }
 
-/// Adds a frame's log-likelihoods to the means of its track.
-void add_frame(CodeEvidence& evidence, const FrameScores& frame, double prior) {
-    std::vector<float>& means = evidence.means;
-    const auto known = size_t(std::max_element(means.begin(), means.end()) - means.begin());
-    const auto update = [&](size_t k, float now) { means[k] += float((now - means[k]) / evidence.count); };
-    // Words differ so much that one which a frame alone proves excludes all others.
-    if (known && frame.of_code(known) - frame.none > prior - std::log(kMaxError)) {
-        evidence.count = std::min(evidence.count + 1, kRemembered);
-        update(0, frame.none);
-        update(known, frame.of_code(known));
-        return;
+/// Adds up the scores of parts of words at all turns, one a lane; lanes beyond the last turn repeat the first
+/// ones.
+class TurnSums {
+  public:
+    ROUNDEL_INLINE explicit TurnSums(const SectorScores& sectors) {
+        for (int part = 0; part < kParts; ++part) {
+            auto& table = table_[part];
+            for (int v = 0; v < kVectors; ++v) table[0][v] = all(part ? 0 : sectors.white);
+            for (int k = 0, n = 1; k < kBits; ++k, n *= 2)
+                for (int v = 0; v < kVectors; ++v) {
+                    const Lanes black = load(sectors.black + part * kBits + k + v * kLanes);
+                    for (int bits = 0; bits < n; ++bits) table[n + bits][v] = table[bits][v] + black;
+                }
+        }
     }
-    std::vector<float> now{frame.none};
-    for (size_t code = 1; code <= code_words().size(); ++code) now.push_back(frame.of_code(code));
-    const float most = *std::max_element(now.begin(), now.end());
-    // The track may have become another roundel's.
-    if (means.empty() || most - now[known] > prior - std::log(kChanged)) {
-        means.assign(now.size(), 0);
-        evidence.count = 0;
+    ROUNDEL_INLINE Lanes of(Word word, int v) const {
+        Lanes sum = table_[0][word & kMask][v];
+        for (int part = 1; part < kParts; ++part) sum += table_[part][word >> (part * kBits) & kMask][v];
+        return sum;
     }
-    evidence.count = std::min(evidence.count + 1, kRemembered);
-    for (size_t k = 0; k < now.size(); ++k) update(k, now[k]);
+    static constexpr int kVectors = kPadded / kLanes;
+
+  private:
+    static constexpr int kBits = 6, kParts = kCodeSectors / kBits;
+    static constexpr Word kMask = (1 << kBits) - 1;
+    Lanes table_[kParts][kMask + 1][kVectors];
+};
+
+ROUNDEL_CLONES size_t most_probable(const std::vector<float>& codes) {
+    Lanes best = load(codes.data());
+    for (size_t k = kLanes; k < codes.size(); k += kLanes) best = greater(best, load(&codes[k]));
+    return size_t(std::find(codes.begin(), codes.end(), greatest(best)) - codes.begin());
+}
+
+/// The log-likelihoods of all codes at their best turns, in whole lanes.
+ROUNDEL_CLONES std::vector<float> score_codes(const SectorScores& sectors) {
+    const std::vector<Word>& words = code_words();
+    const TurnSums sums(sectors);
+    std::vector<float> codes((words.size() + kLanes - 1) / kLanes * kLanes, kImpossible);
+    for (size_t code = 0; code < words.size(); ++code) {
+        Lanes best = sums.of(words[code], 0);
+        for (int v = 1; v < TurnSums::kVectors; ++v) best = greater(best, sums.of(words[code], v));
+        codes[code] = greatest(best);
+    }
+    return codes;
+}
+
+/// The sum of the likelihoods of all codes but one over that of this one, the most probable, to a power.
+ROUNDEL_CLONES double odds_of_others(std::vector<float> codes, size_t one, float power) {
+    const float most = std::exchange(codes[one], kImpossible);
+    Lanes total{};
+    for (size_t k = 0; k < codes.size(); k += kLanes) total += exponential(power * (load(&codes[k]) - most));
+    return double(sum(total));
+}
+
+/// No code is as probable as any code at any turn.
+float log_prior() {
+    static const float prior = std::log(float(code_words().size() * kCodeSectors));
+    return prior;
+}
+
+int best_turn(const SectorScores& sectors, Word word) {
+    float sums[kCodeSectors] = {};
+    for (; word; word &= word - 1)
+        for (int turn = 0; turn < kCodeSectors; ++turn)
+            sums[turn] += sectors.black[std::countr_zero(word) + turn];
+    return int(std::max_element(sums, sums + kCodeSectors) - sums);
 }
 
 /// The angle from the first sample's side to the zero of a word, and its variance, radians.
@@ -206,11 +270,10 @@ struct Zero {
 /// Least squares over the edges between ink and paper. Unknowns: an error of the levels, which displaces both
 /// kinds of edges in opposite directions; the displacement of the ring's centre, of which the fit has the
 /// variance `centre` in radians of the ring; the lateness of the zero. Lengths are in samples.
-Zero find_zero(const Profile& profile, const SectorLevels& sectors, Word seen, int turn, double noise,
-               double centre) {
+Zero find_zero(const Profile& profile, int start, Word seen, int turn, double noise, double centre) {
     constexpr int kUnknowns = 4;
-    const int m = profile.per_sector, n = int(profile.size());
-    const double step = kTau / n, prior = m * square(noise) * square(step) / centre;
+    const int m = profile.per_sector;
+    const double step = kTau / (m * kCodeSectors), prior = m * square(noise) * square(step) / centre;
     std::array<Vector<kUnknowns>, kUnknowns> H{};
     Vector<kUnknowns> right{};
     double squares = 0, gain = 0;
@@ -219,19 +282,17 @@ Zero find_zero(const Profile& profile, const SectorLevels& sectors, Word seen, i
     for (int k = 0; k < kCodeSectors; ++k) {
         const bool before = seen >> k & 1, after = seen >> ((k + 1) % kCodeSectors) & 1;
         if (before == after) continue;
-        double black = 0;
-        const int middle = sectors.start + k * m + m / 2;
-        for (int j = 0; j < m; ++j) black += profile.black[size_t((middle + j) % n)];
+        const double black = profile.between(k, start);
         if (!std::isfinite(black)) continue;
         const double late = before ? black - m / 2.0 : m / 2.0 - black;
-        const double angle = step * (middle + m / 2.0);
-        const Vector<kUnknowns> J{before ? 1.0 : -1.0, std::cos(angle), std::sin(angle), 1};
+        const auto [x, y] = kAround.at(k + 1, 2 * start * kFinest / m);
+        const Vector<kUnknowns> J{before ? 1.0 : -1.0, double(x), double(-y), 1};
         for (size_t i = 0; i < kUnknowns; ++i) {
             right[i] += J[i] * late;
             for (size_t j = 0; j <= i; ++j) H[i][j] += J[i] * J[j];
         }
         squares += late * late;
-        gain += square(profile.gains[size_t(k)]);
+        gain += square(double(profile.gains.at[k]));
         ++edges;
     }
     const Cholesky<kUnknowns> factor(H);
@@ -241,8 +302,7 @@ Zero find_zero(const Profile& profile, const SectorLevels& sectors, Word seen, i
     // Both edges of an arc are wrong together where compression or blur displaces it: they count as one.
     const double variance =
         2 * std::max(m * square(noise) * gain / edges, squares / std::max(1, edges - kUnknowns));
-    return {step * (sectors.start + turn * m + x[3]),
-            square(step) * variance * factor.inverse_tail<1>()[0][0]};
+    return {step * (start + turn * m + x[3]), square(step) * variance * factor.inverse_tail<1>()[0][0]};
 }
 
 /// The place on the outer ellipse of the point of the outer circle at an angle.
@@ -260,36 +320,48 @@ double on_ellipse(const Parameters& p, double angle) {
 }  // namespace
 
 CodeReading CodeTrack::add(const ImageView& image, const RoundelFit& fit) {
-    const double contrast = fit.p[kBright] - fit.p[kDark];
-    const Profile profile = sample_ring(image, fit.p);
-    const SectorLevels sectors = find_sectors(profile);
-    const double noise = std::max(1.0, fit.noise) / contrast;
-    const FrameScores frame = score(sectors, profile.gains, noise);
-    const double rho = square(kModelError) / (square(kModelError) + square(noise));
-    const size_t n_codes = code_words().size();
-    const double prior = std::log(double(n_codes) * kCodeSectors);
-    add_frame(evidence_, frame, prior);
+    const double noise = std::max(1.0, fit.noise) / (fit.p[kBright] - fit.p[kDark]);
+    const double sigma = std::hypot(noise, kModelError);
+    Profile profile;
+    SectorLevels sectors;
+    SectorScores scores;
+    sample_ring(image, fit.p, profile);
+    find_sectors(profile, sectors);
+    score(profile, sectors, sigma, scores);
+    // Without a code, most rings are less probable with any word than without.
+    if (means_.empty() && scores.most < log_prior()) return {};
+    const std::vector<float> codes = score_codes(scores);
+    include(codes);
+    if (means_.empty()) return {};
 
-    // No code is as probable as any code at any turn.
-    const std::vector<float>& means = evidence_.means;
-    const double frames = evidence_.count / (1 + (evidence_.count - 1) * rho);
-    const auto best = std::max_element(means.begin() + 1, means.end()) - means.begin();
-    const double top = means[size_t(best)];
-    double others = std::exp(std::min(frames * (means[0] - top) + prior, 700.0));
-    for (size_t k = 1; k < means.size(); ++k) {
-        const double below = frames * (means[k] - top);
-        if (k != size_t(best) && below > kNegligible) others += std::exp(below);
-    }
+    const double rho = square(kModelError / sigma), frames = count_ / (1 + (count_ - 1) * rho);
+    const size_t best = most_probable(means_);
+    const double others = odds_of_others(means_, best, float(frames)) +
+                          std::exp(double(log_prior()) - frames * double(means_[best]));
     if (!(others < kMaxError)) return {};
-    if (frame.of_code(size_t(best)) < frame.none) return {int(best), 1 / (1 + others), NAN, NAN};  // covered
+    const int name = int(best) + 1;
+    if (codes[best] < 0) return {name, 1 / (1 + others), NAN, NAN};  // covered
     // The fit measures the offset of the disc's centre; that of the ring's centre is as large relative to it.
     const Symmetric offset = fit.offset_covariance();
     const double centre = (offset.xx + offset.yy) / (2 * fit.outer.major * fit.outer.minor / 4) *
                           square((square(kMiddle) - 1) / kMiddle);
-    const int turn = frame.turn_of(size_t(best));
-    const Word seen = turned(code_words()[size_t(best - 1)], turn);
-    const Zero zero = find_zero(profile, sectors, seen, turn, noise, centre);
-    return {int(best), 1 / (1 + others), on_ellipse(fit.p, zero.angle), std::sqrt(zero.variance)};
+    const Word word = code_words()[best];
+    const int turn = best_turn(scores, word);
+    const Zero zero = find_zero(profile, sectors.start, turned(word, turn), turn, noise, centre);
+    return {name, 1 / (1 + others), on_ellipse(fit.p, zero.angle), std::sqrt(zero.variance)};
+}
+
+/// Adds a frame's log-likelihoods to the means of the track. They start anew where the track has more
+/// probably become another roundel's, and end where no code is more probable than all.
+void CodeTrack::include(const std::vector<float>& codes) {
+    const float most = std::max(log_prior(), codes[most_probable(codes)]);
+    if (means_.empty() || double(most - codes[most_probable(means_)]) > -std::log(kChanged)) {
+        means_.assign(codes.size(), 0);
+        count_ = 0;
+    }
+    count_ = std::min(count_ + 1, kRemembered);
+    for (size_t k = 0; k < codes.size(); ++k) means_[k] += (codes[k] - means_[k]) / float(count_);
+    if (means_[most_probable(means_)] < log_prior()) means_.clear();
 }
 
 }  // namespace roundel

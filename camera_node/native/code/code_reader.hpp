@@ -16,12 +16,6 @@ struct CodeReading {
     double rotation = 0, sigma = 0;
 };
 
-/// Mean log-likelihoods of the frames of a track: of no code, then of each code.
-struct CodeEvidence {
-    double count = 0;  // frames
-    std::vector<float> means;
-};
-
 /// What the frames of a track show of its code (detector_model.md, section 10).
 ///
 /// Errors of the model, such as uneven light, are alike in all frames. With the share `rho` of them in the
@@ -32,7 +26,11 @@ class CodeTrack {
     CodeReading add(const ImageView& image, const RoundelFit& fit);
 
   private:
-    CodeEvidence evidence_;
+    void include(const std::vector<float>& codes);
+
+    double count_ = 0;  // frames
+    std::vector<float>
+        means_;  // of the codes' log-likelihoods over that of no code; none where that is greater
 };
 
 }  // namespace roundel
