@@ -125,7 +125,7 @@ def with_aligned_clocks(result: WandCalibration, alignment: Alignment, start_s: 
         cameras[name] = msgspec.structs.replace(
             cameras[name],
             time_offset_ms=float(offset_ms[k]),
-            time_drift_ppm=1e6 * rate[k],
+            time_drift_ppm=1e6 * float(rate[k]),
             time_reference_ns=alignment.reference_ns,
         )
     return replace(

@@ -154,7 +154,8 @@ def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) 
 
 
 def triangulate_markers(adjusted: Adjusted, observations: WandObservations) -> Array:
-    """(K, M, 3) positions of the wand's markers by the cameras alone, world; NaN where fewer than two cameras saw one.
+    """(K, M, 3) positions of the wand's markers by the cameras alone, world; NaN where fewer than two cameras saw one,
+    or their rays are parallel.
 
     One Gauss-Newton step of every marker of a frame set from its adjusted position, without the wand's lengths.
     """
@@ -169,7 +170,7 @@ def triangulate_markers(adjusted: Adjusted, observations: WandObservations) -> A
     np.add.at(b, (k, m), np.einsum("nji,njk,nk->ni", J, weight, residuals))
     views = np.zeros((*markers.shape[:2], len(problem.lenses)))
     views[k, m, camera] = 1
-    observed = views.sum(axis=2) >= 2
+    observed = (views.sum(axis=2) >= 2) & (np.linalg.matrix_rank(A, hermitian=True) == 3)
     points = np.full(markers.shape, np.nan)
     points[observed] = markers[observed] + np.linalg.solve(A[observed], b[observed][:, :, None])[:, :, 0]
     return points

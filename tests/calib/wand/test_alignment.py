@@ -4,6 +4,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -11,13 +12,15 @@ import pytest
 
 from calib.errors import CalibrationError
 from calib.rig.recording import as_they_arrived
+from calib.rig.rig import Rig, load_rig, save_rig
 from calib.wand.alignment import align_clocks
 from calib.wand.calibrate import calibrate
+from calib.wand.nominal_lens import nominal_lens
 from calib.wand.scale import Distance
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 from tests.calib.recordings import EPOCH_S, SimulatedRecording, WandScenario, record
-from tests.calib.synthetic import EXACT, STICK, camera_errors, ring, roughly
+from tests.calib.synthetic import EXACT, STICK, WAND, camera_errors, ring, roughly
 from tests.calib.synthetic import record as record_ring
 
 LIGHT = Body(diameter_m=0.1)
@@ -99,7 +102,7 @@ def test_a_shift_of_seconds_is_named_as_such():
         calibrate(recorded.intrinsics, LIGHT, stamped, synchronous=True)
 
 
-def test_drifts_are_stored_and_hold_at_both_ends_of_a_recording():
+def test_drifts_are_stored_and_hold_at_both_ends_of_a_recording(tmp_path: Path):
     """Clocks of 3000 ppm: after half of twelve seconds they are 9 ms apart, and the rig has the rest to 0.3 ms."""
     scenario = WandScenario(
         cameras=3,
@@ -115,7 +118,9 @@ def test_drifts_are_stored_and_hold_at_both_ends_of_a_recording():
         seed=2,
     )
     recorded = record(scenario)
-    rig = calibrate(recorded.intrinsics, STICK, recorded.messages).rig
+    path = tmp_path / "rig.yaml"
+    save_rig(calibrate(recorded.intrinsics, STICK, recorded.messages).rig, path)
+    rig = load_rig(path)
     true_ns = {
         name: lambda t_ns, k=camera, rate=1e-6 * recorded.drift_ppm[name]: (
             t_ns + 1e6 * k.time_offset_ms + rate * (t_ns - 1e9 * (EPOCH_S + 6))
@@ -126,6 +131,49 @@ def test_drifts_are_stored_and_hold_at_both_ends_of_a_recording():
         t_ns = round(1e9 * (EPOCH_S + t_s))
         late = np.array([rig.cameras[n].capture_ns(t_ns) - true_ns[n](t_ns) for n in true_ns]) * 1e-6
         assert np.abs(late - late.mean()).max() < 0.3
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_clocks_before_a_slow_wand_are_found(seed: int):
+    """Twenty seconds of a hand that moves below 0.4 Hz: many shifts correlate as well as the right one."""
+    scenario = WandScenario(
+        cameras=2,
+        arc=0.5,
+        seconds=20,
+        rate_hz=20,
+        sigma_px=0.3,
+        outliers=0.01,
+        speed=0.3,
+        offset_ms=0,
+        drift_ppm=0,
+        numbered=True,
+        sized=False,
+        both_sides=True,
+        wand=STICK,
+        seed=seed,
+    )
+    recorded = record(scenario)
+    stamped = with_clocks(recorded.messages, {"cam01": (12.7, 0.008)})
+    nominal = Rig(
+        cameras={name: nominal_lens(c.width, c.height) for name, c in recorded.truth.cameras.items()}
+    )
+    alignment = align_clocks(nominal, STICK, stamped)
+    true_ns = {(m.camera, m.seq): m.t_ns for m in recorded.messages}
+    late: dict[str, list[float]] = {"cam00": [], "cam01": []}
+    for m in alignment.apply(stamped):
+        late[m.camera].append(1e-9 * (m.t_ns - true_ns[m.camera, m.seq]))
+    apart = np.array([late["cam01"][end] - late["cam00"][end] for end in (0, -1)])
+    assert np.abs(apart).max() < 0.02  # what the adjustment finds by itself is 0.3 s
+
+
+def test_motions_of_different_wands_are_not_aligned():
+    first, second = (
+        record(WandScenario(cameras=2, seconds=15, rate_hz=20, numbered=True, both_sides=True, seed=seed))
+        for seed in (1, 2)
+    )
+    mixed = [m for m in first.messages if m.camera == "cam00"]
+    mixed += [m for m in second.messages if m.camera == "cam01"]
+    assert not align_clocks(first.intrinsics, WAND, mixed).maps
 
 
 def test_clocks_that_a_server_keeps_are_not_changed():
