@@ -56,6 +56,46 @@ class FramePoses:
     ) -> Array:
         """(N, 2, 13) whitened equations of shears: axes (2, N), angle (N,), scale (2, 2, N), sigma (N,)."""
 
+class BodyFit:
+    """Fits B bodies to N centres by repeated linearization; see `native/body_fit.hpp`."""
+
+    def __init__(
+        self,
+        bodies: BodyStates,
+        exposures: CameraExposures,
+        discs: DiscColumns,
+        xy: Array,
+        whiten: Array,
+        single: NDArray[np.bool_],
+        axes: Array,
+        angle: Array,
+        scale: Array,
+        sigma: Array,
+        shaped: NDArray[np.bool_],
+        turned: NDArray[np.bool_],
+        information: Array,
+        /,
+    ) -> None:
+        """As of `FramePoses`; (N,) whose outlines and whose headings count, and (B, 12, 12) of the bodies."""
+
+    def linearize(self, headings: Array, /) -> tuple[Array, Array]:
+        """The robustly weighted systems of the K moving bodies, all of them at first: (K, 12, 12) and (K, 12).
+
+        headings (T, 2, 13): the equations of the `turned` rows.
+        """
+
+    def step(self, steps: Array, small: float, /) -> bool:
+        """Displace the moving bodies by (K, 12). Whether some moved by `small` or more: only these still move."""
+
+    def estimates(self) -> tuple[Array, Array]:
+        """R (B, 3, 3), and p, omega and v (3, B, 3)."""
+
+    def covariances(self, P: Array, /) -> Array:
+        """P (B, 12, 12) with those of the bodies that have observations; raises RuntimeError as `inverses`."""
+
+    def centres(self) -> tuple[Array, Array, Array]:
+        """The last equations of the centres (N, 2, 13), their weights (N,) and whitened residuals (N, 2)."""
+
 class DetectionColumns:
     """N detections sorted by frame."""
 
@@ -143,14 +183,6 @@ def predict(
 
     densities (N, 2) and single (N,): see `fusion.model.states.predict`.
     """
-
-def reweigh(
-    equations: Array, body: Index, information: Array, right: Array, weights: Array, /
-) -> tuple[Array, Array, Array]:
-    """Adds K priors and N robustly weighted equations: information (K, 12, 12), right (K, 12), weights (N,)."""
-
-def residuals(equations: Array, body: Index, steps: Array, /) -> Array:
-    """(2, N) whitened residuals of the equations after steps (K, 12)."""
 
 def eliminate_bodies(
     equations: Array,

@@ -167,11 +167,13 @@ class CameraArray:
 
     def frame_poses(self, states: States, exposures: Exposures) -> _core.FramePoses:
         """The poses of all bodies at the capture times of all frames."""
+        return _core.FramePoses(states.bodies, self.exposed(exposures))
+
+    def exposed(self, exposures: Exposures) -> _core.CameraExposures:
+        """The frames for the native core."""
         k = exposures.camera
-        cameras = _core.CameraExposures(
-            self.R_cam_world[k], self.centres[k], exposures.tau, exposures.tau_sigma
-        )
-        return _core.FramePoses(states.bodies, cameras)
+        at = self.R_cam_world[k], self.centres[k]
+        return _core.CameraExposures(*at, exposures.tau, exposures.tau_sigma)
 
     def views(self, states: States, exposures: Exposures, discs: Discs) -> Views:
         """Project discs at the capture times of their frames."""

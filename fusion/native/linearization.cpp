@@ -68,24 +68,23 @@ void write_shears(const Shear (&at)[3], const PlaneAxes& about, double sigma, Eq
 
 }  // namespace
 
-void linearize(const FramePoses& poses, const CentreObservations& observed, Equations* to) {
+Equations linearize(const FramePoses& poses, const CentreObservations& observed, size_t k) {
     const Discs& discs = observed.discs;
-    for (size_t k = 0; k < discs.size(); ++k) {
-        const Exposure exposure = poses.exposure(discs, k);
-        const BodyInCamera body = poses.at(discs, k);
-        const DiscOnBody disc = discs.at(k);
-        const DiscView expected = view_disc(body, disc);
-        const double x = observed.xy.at(0, k) - expected.x, y = observed.xy.at(1, k) - expected.y;
-        to[k] = {};
-        if (!std::isfinite(x + y)) continue;
-        for (int a = 0; a < 2; ++a) {
-            const double wx = observed.whiten.at(2 * a, k), wy = observed.whiten.at(2 * a + 1, k);
-            double* row = to[k].A[a];
-            write_row(differentiate(expected, disc.radius, wx, wy), body, exposure, disc, row);
-            if (observed.single[discs.body[k]]) write(row + 6, {0, 0, 0});
-            row[kErrors] = wx * x + wy * y;
-        }
+    const Exposure exposure = poses.exposure(discs, k);
+    const BodyInCamera body = poses.at(discs, k);
+    const DiscOnBody disc = discs.at(k);
+    const DiscView expected = view_disc(body, disc);
+    const double x = observed.xy.at(0, k) - expected.x, y = observed.xy.at(1, k) - expected.y;
+    Equations to{};
+    if (!std::isfinite(x + y)) return to;
+    for (int a = 0; a < 2; ++a) {
+        const double wx = observed.whiten.at(2 * a, k), wy = observed.whiten.at(2 * a + 1, k);
+        double* row = to.A[a];
+        write_row(differentiate(expected, disc.radius, wx, wy), body, exposure, disc, row);
+        if (observed.single[discs.body[k]]) write(row + 6, {0, 0, 0});
+        row[kErrors] = wx * x + wy * y;
     }
+    return to;
 }
 
 void differentiate(const FramePoses& poses, const Discs& discs, Columns<4> whiten, Columns<2> by_focal,
@@ -110,27 +109,26 @@ void differentiate(const FramePoses& poses, const Discs& discs, Columns<4> white
     }
 }
 
-void linearize(const FramePoses& poses, const OutlineObservations& observed, Equations* to) {
+Equations linearize(const FramePoses& poses, const OutlineObservations& observed, size_t k) {
     const Discs& discs = observed.discs;
-    for (size_t k = 0; k < discs.size(); ++k) {
-        const BodyInCamera body = poses.at(discs, k);
-        const DiscView expected = view_disc(body, discs.at(k));
-        to[k] = {};
-        const Shape measured =
-            measured_outline(observed.axes.at(0, k), observed.axes.at(1, k), observed.angle[k]);
-        const Scale scale = scale_at(observed.scale, k);
-        const auto shear_at = [&](const Vector& normal) {
-            return shear(measured, outline(expected.centre, normal, discs.radius[k], scale));
-        };
-        const Vector n = expected.normal;
-        const PlaneAxes about =
-            PlaneAxes::of(discs.normal.vector(k));  // a rotation about one moves n by the other
-        const Shear at[] = {shear_at(n), shear_at(n - kStep * (body.R_cam * about.second)),
-                            shear_at(n + kStep * (body.R_cam * about.first))};
-        const double sum = at[0].along + at[0].across + at[1].along + at[2].along;
-        if (!std::isfinite(sum + expected.x)) continue;  // behind the camera, or seen edge-on
-        write_shears(at, about, observed.sigma[k], to[k]);
-    }
+    const BodyInCamera body = poses.at(discs, k);
+    const DiscView expected = view_disc(body, discs.at(k));
+    const Shape measured =
+        measured_outline(observed.axes.at(0, k), observed.axes.at(1, k), observed.angle[k]);
+    const Scale scale = scale_at(observed.scale, k);
+    const auto shear_at = [&](const Vector& normal) {
+        return shear(measured, outline(expected.centre, normal, discs.radius[k], scale));
+    };
+    const Vector n = expected.normal;
+    const PlaneAxes about =
+        PlaneAxes::of(discs.normal.vector(k));  // a rotation about one moves n by the other
+    const Shear at[] = {shear_at(n), shear_at(n - kStep * (body.R_cam * about.second)),
+                        shear_at(n + kStep * (body.R_cam * about.first))};
+    Equations to{};
+    const double sum = at[0].along + at[0].across + at[1].along + at[2].along;
+    // Otherwise it is behind the camera, or seen edge-on.
+    if (std::isfinite(sum + expected.x)) write_shears(at, about, observed.sigma[k], to);
+    return to;
 }
 
 }  // namespace roundel::fusion

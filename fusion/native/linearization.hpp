@@ -21,7 +21,7 @@ struct CentreObservations {
     Columns<4> whiten;
     const bool* single;  // by body: has one marker, so its angular velocity would only fit noise
 };
-void linearize(const FramePoses& poses, const CentreObservations& observed, Equations* to);
+Equations linearize(const FramePoses& poses, const CentreObservations& observed, size_t k);
 
 constexpr int kCameraErrors = 8;  // rotation and position (camera frame), clock offset, log focal length
 
@@ -48,6 +48,6 @@ struct OutlineObservations {
     Columns<4> scale;
     const double* sigma;
 };
-void linearize(const FramePoses& poses, const OutlineObservations& observed, Equations* to);
+Equations linearize(const FramePoses& poses, const OutlineObservations& observed, size_t k);
 
 }  // namespace roundel::fusion

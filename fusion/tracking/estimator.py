@@ -4,8 +4,8 @@
     posterior of the last frame set -- white-noise-on-acceleration motion -- observations of this frame set
 
 The graph has one component for each robot, with two HessianFactors: the predicted posterior, and the observations.
-`native/linearization.cpp` linearizes each observation at its own capture time, `native/normal_equations.cpp` weighs
-them (Cauchy). See docs/design/fusion_filter.md.
+`native/body_fit.cpp` linearizes each observation at its own capture time and weighs it (Cauchy).
+See docs/design/fusion_filter.md.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Mask
 from fusion import _core
 from fusion.model.frames import COV, OUTLINE
 from fusion.model.observations import CameraArray, MatchedObservations
@@ -46,69 +46,6 @@ class Prediction:
         """States at the time of the frame set."""
         n = len(states)
         return cls(states, _core.inverses(states.P), Transition(np.zeros((n, 3, 3)), np.zeros(n)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
-    """The observations of a frame set, and the priors of the K visible bodies.
-
-    Attributes:
-        observations: N observations.
-        shaped, turned: (S,) and (T,) rows whose outlines and whose headings are observed too.
-        bodies: (K,) rows of the states.
-        prior: (K, 12, 12) information.
-    """
-
-    observations: MatchedObservations
-    shaped: Index
-    turned: Index
-    bodies: Index
-    prior: Array
-
-    def select(self, rows: Mask) -> tuple["_Problem", Mask]:
-        """The problem of some of the K bodies, and which of the equations belong to it."""
-        is_chosen = np.zeros(int(self.bodies[-1]) + 1, bool)
-        is_chosen[self.bodies[rows]] = True
-        mine = is_chosen[self.observations.discs.body]
-        number = np.cumsum(mine) - 1
-        part = _Problem(
-            self.observations.select(mine),
-            number[self.shaped[mine[self.shaped]]],
-            number[self.turned[mine[self.turned]]],
-            self.bodies[rows],
-            self.prior[rows],
-        )
-        return part, np.concatenate([mine, mine[self.shaped], mine[self.turned]])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solution:
-    """The result of one iteration.
-
-    Attributes:
-        delta: (B, 12) errors of all bodies relative to the prediction.
-        step: (K, 12) last step of the visible bodies.
-        information: (K, 12, 12) of the visible bodies.
-        equations: (N + S + T, 2, 13) linearized.
-        weights: (N + S + T,) of the equations.
-        residuals: (2, N + S + T) whitened.
-    """
-
-    delta: Array
-    step: Array
-    information: Array
-    equations: Array
-    weights: Array
-    residuals: Array
-
-    def updated(self, bodies: Mask, equations: Mask, part: "_Solution") -> "_Solution":
-        """With another iteration of some of the K bodies, which have these equations; the others have no step."""
-        step, information = np.zeros_like(self.step), self.information.copy()
-        rows, weights, residuals = self.equations.copy(), self.weights.copy(), self.residuals.copy()
-        step[bodies], information[bodies] = part.step, part.information
-        rows[equations], weights[equations] = part.equations, part.weights
-        residuals[:, equations] = part.residuals
-        return _Solution(part.delta, step, information, rows, weights, residuals)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,32 +109,37 @@ class Estimator:
 
     def fit(self, prediction: Prediction, observations: MatchedObservations, small: float = SMALL) -> BodyFit:
         """`update` by `prepared` observations."""
-        states, n = prediction.states, len(prediction.states)
-        bodies = np.flatnonzero(np.bincount(observations.discs.body, minlength=n))
-        if not len(bodies):
+        states, seen, discs = prediction.states, observations.detections, observations.discs
+        if not len(observations):
             return BodyFit(states, np.empty((2, 0)), np.empty((0, 2, 13)), np.empty(0))
-        extra = _shaped(observations), read_headings(observations)
-        problem = _Problem(observations, *extra, bodies, prediction.information[bodies])
-        solution = self._solve(problem, states, np.zeros((n, 12)))
-        for _ in range(MAX_ITERATIONS - 1):
-            moved = np.abs(solution.step[:, :6]).max(1) >= small
-            if not moved.any():
+        sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
+        turned = read_headings(observations)
+        with_headings, headings = observations.select(turned), np.empty((0, 2, 13))
+        fit = _core.BodyFit(
+            states.bodies,
+            self.cameras.exposed(seen.exposures),
+            discs.columns,
+            seen.xy,
+            observations.whiten,
+            self.single,
+            seen.axes_px,
+            seen.angle_rad,
+            seen.scale,
+            sigma,
+            _shaped(observations),
+            turned,
+            prediction.information,
+        )
+        for _ in range(MAX_ITERATIONS):
+            if len(with_headings):
+                headings = linearize_headings(self.cameras, _estimates(fit, states.P), with_headings)
+            if not fit.step(_eliminate(*fit.linearize(headings)), small):
                 break
-            part, equations = problem.select(moved)
-            at = states.retract(solution.delta)
-            again = self._solve(part, at, solution.delta, solution.weights[equations])
-            solution = solution.updated(moved, equations, again)
-        P = states.P.copy()
-        P[bodies] = _core.inverses(solution.information)
+        P = fit.covariances(states.P)
         if self.single.any():
             P[self.single] = reset_unobservable(P[self.single])
-        centres = slice(len(observations))
-        return BodyFit(
-            replace(states.retract(solution.delta), P=P),
-            _in_pixels(observations, solution.residuals),
-            solution.equations[centres],
-            solution.weights[centres],
-        )
+        equations, weights, residuals = fit.centres()
+        return BodyFit(_estimates(fit, P), _in_pixels(observations, residuals.T), equations, weights)
 
     def with_time_errors(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """With the noise of late frames and of the clocks of the cameras."""
@@ -217,46 +159,6 @@ class Estimator:
     def select(self, rows: NDArray) -> "Estimator":
         """The estimator of some of the bodies."""
         return Estimator(self.cameras, self.densities[rows], self.single[rows])
-
-    def _solve(
-        self, problem: _Problem, at: States, delta: Array, weights: Array | None = None
-    ) -> "_Solution":
-        """Linearize once about `at`, which is displaced from the prediction by `delta`; weigh and eliminate.
-
-        Without `weights` it is the first iteration, which is about the prediction.
-        """
-        row = np.cumsum(np.bincount(problem.bodies, minlength=len(at))) - 1
-        of_disc = problem.observations.discs.body
-        body = row[np.concatenate([of_disc, of_disc[problem.shaped], of_disc[problem.turned]])]
-        equations = self._linearize(at, problem)
-        if weights is None:
-            right, weights = np.zeros((len(problem.bodies), 12)), np.ones(len(equations))
-        else:
-            right = -(problem.prior @ delta[problem.bodies, :, None])[:, :, 0]
-        information, right, weights = _core.reweigh(equations, body, problem.prior, right, weights)
-        step = _eliminate(information, right)
-        delta = delta.copy()
-        delta[problem.bodies] += step
-        residuals = _core.residuals(equations, body, step)
-        return _Solution(delta, step, information, equations, weights, residuals)
-
-    def _linearize(self, states: States, problem: _Problem) -> Array:
-        """(N + S + T, 2, 13) equations of centres, then of outlines, then of headings; see `_core.FramePoses`."""
-        seen, discs = problem.observations.detections, problem.observations.discs
-        poses = self.cameras.frame_poses(states, seen.exposures)
-        equations = poses.linearize_centres(discs.columns, seen.xy, problem.observations.whiten, self.single)
-        parts = [equations]
-        if len(problem.shaped):
-            discs, seen = discs.select(problem.shaped), seen.select(problem.shaped)
-            sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
-            parts.append(
-                poses.linearize_outlines(discs.columns, seen.axes_px, seen.angle_rad, seen.scale, sigma)
-            )
-        if len(problem.turned):
-            parts.append(
-                linearize_headings(self.cameras, states, problem.observations.select(problem.turned))
-            )
-        return np.concatenate(parts)
 
     def _image_velocity(self, states: States, observations: MatchedObservations) -> Array:
         """(2, N) velocities of the discs' images, pixels/s; 0 where the disc is not visible."""
@@ -328,6 +230,11 @@ def _sheared(axes_px: Array, angle_rad: Array, B: Array) -> tuple[Array, Array]:
     return axes_px, angle_rad
 
 
+def _estimates(fit: _core.BodyFit, P: Array) -> States:
+    R, (p, omega, v) = fit.estimates()
+    return States(R, p, omega, v, P)
+
+
 def _eliminate(information: Array, right: Array) -> Array:
     """(K, 12) corrections of K bodies by one elimination."""
     graph = gtsam.GaussianFactorGraph()
@@ -346,8 +253,8 @@ def _ordering(n: int) -> gtsam.Ordering:
 
 
 def _in_pixels(observations: MatchedObservations, whitened: Array) -> Array:
-    """(2, N) residuals in pixels of the N centres, which come first in `whitened`."""
-    x, y = whitened[:, : len(observations)]
+    """(2, N) residuals in pixels of N centres."""
+    x, y = whitened
     cov = observations.detections.cov
     u = np.sqrt(cov[0, 0])  # whitened = L^-1 pixels, where L L^T is the covariance
     v = cov[0, 1] / u
@@ -355,12 +262,10 @@ def _in_pixels(observations: MatchedObservations, whitened: Array) -> Array:
     return np.where(np.isfinite(observations.whiten[0, 0]), error, np.nan)
 
 
-def _shaped(observations: MatchedObservations) -> Index:
-    """Rows with known outlines of bodies with fewer than `MIN_SHAPED` visible markers."""
+def _shaped(observations: MatchedObservations) -> Mask:
+    """(N,) known outlines of bodies with fewer than `MIN_SHAPED` visible markers."""
     discs = observations.discs
     body = np.full(np.max(discs.marker, initial=0) + 1, -1)
     body[discs.marker] = discs.body
     n_markers = np.bincount(body[body >= 0], minlength=1)
-    return np.flatnonzero(
-        (n_markers[discs.body] < MIN_SHAPED) & np.isfinite(observations.detections.axes_px[1])
-    )
+    return (n_markers[discs.body] < MIN_SHAPED) & np.isfinite(observations.detections.axes_px[1])

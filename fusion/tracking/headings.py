@@ -7,7 +7,7 @@ follow from its dual conic, and the angle of S^(-1/2) (x - e) is what detectors 
 
 import numpy as np
 
-from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.outline import half_axes_of
 from camera_node.geometry.pose import rotation_from_vector
 from fusion.model.observations import CameraArray, DetectionTable, Discs, MatchedObservations
@@ -18,12 +18,12 @@ STEP = 1e-4  # rad, of the difference quotients
 WIDENED = 2.0
 
 
-def read_headings(observations: MatchedObservations) -> Index:
-    """The rows with a rotation that its robot needs."""
+def read_headings(observations: MatchedObservations) -> Mask:
+    """(N,) whether a rotation was read that its robot needs."""
     if observations.discs.zero is None:
-        return np.empty(0, np.intp)
+        return np.zeros(len(observations), bool)
     known = np.isfinite(observations.detections.rotation) & np.isfinite(observations.discs.zero[0])
-    return np.flatnonzero(known & (observations.detections.code >= 0))
+    return known & (observations.detections.code >= 0)
 
 
 def linearize_headings(cameras: CameraArray, states: States, observations: MatchedObservations) -> Array:

@@ -16,6 +16,7 @@ namespace nb = nanobind;
 template <class T, nb::ssize_t... shape>
 using In = nb::ndarray<const T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
 using Index = In<int64_t, -1>;
+using Mask = In<bool, -1>;
 using Numbers = In<double, -1>;
 using Pairs = In<double, 2, -1>;
 using Vectors = In<double, 3, -1>;

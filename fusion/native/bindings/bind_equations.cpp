@@ -10,37 +10,6 @@
 namespace roundel::fusion {
 namespace {
 
-EquationSystem system_of(const EquationArray& equations, const Index& body, size_t n_bodies) {
-    require_equal(equations.shape(0), {body.size()});
-    return {reinterpret_cast<const Equations*>(equations.data()), below(n_bodies, body), body.size(),
-            n_bodies};
-}
-
-auto reweigh_arrays(const EquationArray& equations, const Index& body, const Covariances& information,
-                    const In<double, -1, 12>& right, const Numbers& weights) {
-    const size_t n = information.shape(0);
-    const EquationSystem system = system_of(equations, body, n);
-    require_equal(n, {right.shape(0)});
-    require_equal(body.size(), {weights.size()});
-    auto [H, to_H] = make({n, kErrors, kErrors});
-    auto [g, to_g] = make({n, kErrors});
-    auto [w, to_w] = make({body.size()});
-    std::copy_n(information.data(), information.size(), to_H);
-    std::copy_n(right.data(), right.size(), to_g);
-    std::copy_n(weights.data(), weights.size(), to_w);
-    unlocked([&, to_H = to_H, to_g = to_g, to_w = to_w] {
-        reweigh(system, reinterpret_cast<ErrorMatrix*>(to_H), reinterpret_cast<ErrorVector*>(to_g), to_w);
-    });
-    return std::make_tuple(H, g, w);
-}
-
-Out residuals_of(const EquationArray& equations, const Index& body, const In<double, -1, 12>& steps) {
-    const EquationSystem system = system_of(equations, body, steps.shape(0));
-    auto [both, to] = make({2, body.size()});
-    unlocked([&, to = to] { residuals(system, steps.data(), to); });
-    return both;
-}
-
 Out inverses(const Covariances& information) {
     auto [covariances, to] = make({information.shape(0), kErrors, kErrors});
     const auto* from = reinterpret_cast<const ErrorMatrix*>(information.data());
@@ -98,8 +67,6 @@ void bind_equations(nb::module_& m) {
     m.attr("CAUCHY") = kCauchy;
     m.attr("NOMINAL_WEIGHT") = kNominalWeight;
     m.def("predict", &predict_bodies);
-    m.def("reweigh", &reweigh_arrays);
-    m.def("residuals", &residuals_of);
     m.def("eliminate_bodies", &eliminate_bodies);
     m.def("inverses", &inverses);
 }

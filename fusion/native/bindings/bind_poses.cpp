@@ -4,6 +4,7 @@
 #include <algorithm>
 
 #include "arrays.hpp"
+#include "body_fit.hpp"
 #include "rig_response.hpp"
 
 namespace roundel::fusion {
@@ -43,14 +44,13 @@ void make_exposures(CameraExposures* self, const Rotations& R_cam_world, const P
     new (self) CameraExposures(std::move(exposures));
 }
 
-Discs discs_of(const FramePoses& poses, const DiscColumns& discs) {
+Discs discs_of(size_t n_frames, size_t n_bodies, const DiscColumns& discs) {
     const size_t n = discs.frame.size();
-    return {below(poses.exposures().size(), discs.frame),
-            below(poses.n_bodies(), discs.body),
-            columns<3>(discs.position, n),
-            columns<3>(discs.normal, n),
-            discs.radius.data(),
-            discs.delay.data()};
+    return {below(n_frames, discs.frame), below(n_bodies, discs.body), columns<3>(discs.position, n),
+            columns<3>(discs.normal, n),  discs.radius.data(),         discs.delay.data()};
+}
+Discs discs_of(const FramePoses& poses, const DiscColumns& discs) {
+    return discs_of(poses.exposures().size(), poses.n_bodies(), discs);
 }
 
 Out views_of(const FramePoses& poses, const DiscColumns& columns_of) {
@@ -60,15 +60,22 @@ Out views_of(const FramePoses& poses, const DiscColumns& columns_of) {
     return views;
 }
 
+template <class Observations>
+Out linearized(const FramePoses& poses, const Observations& observed, size_t n) {
+    auto [equations, to] = make({n, 2, kErrors + 1});
+    unlocked([&, to = reinterpret_cast<Equations*>(to)] {
+        for (size_t k = 0; k < n; ++k) to[k] = linearize(poses, observed, k);
+    });
+    return equations;
+}
+
 Out linearize_centres(const FramePoses& poses, const DiscColumns& columns_of, const Pairs& xy,
                       const Matrices2& whiten, const In<bool, -1>& single) {
     const Discs discs = discs_of(poses, columns_of);
     require_equal(poses.n_bodies(), {single.size()});
     const CentreObservations observed{discs, columns<2>(xy, discs.size()), columns<4>(whiten, discs.size()),
                                       single.data()};
-    auto [equations, to] = make({discs.size(), 2, kErrors + 1});
-    unlocked([&, to = to] { linearize(poses, observed, reinterpret_cast<Equations*>(to)); });
-    return equations;
+    return linearized(poses, observed, discs.size());
 }
 
 Out differentiate_by_camera(const FramePoses& poses, const DiscColumns& columns_of, const Matrices2& whiten,
@@ -89,9 +96,7 @@ Out linearize_outlines(const FramePoses& poses, const DiscColumns& columns_of, c
     require_equal(discs.size(), {angle.size(), sigma.size()});
     const OutlineObservations observed{discs, columns<2>(axes, discs.size()), angle.data(),
                                        columns<4>(scale, discs.size()), sigma.data()};
-    auto [equations, to] = make({discs.size(), 2, kErrors + 1});
-    unlocked([&, to = to] { linearize(poses, observed, reinterpret_cast<Equations*>(to)); });
-    return equations;
+    return linearized(poses, observed, discs.size());
 }
 
 Out shears_of(const Pairs& axes, const Numbers& angle, const Vectors& centre, const Vectors& normal,
@@ -110,6 +115,81 @@ Out shears_of(const Pairs& axes, const Numbers& angle, const Vectors& centre, co
     }
     return both;
 }
+
+/// `BodyFit` with the arrays that it reads.
+class ArrayFit {
+  public:
+    ArrayFit(const BodyStates& bodies, const CameraExposures& exposures, const DiscColumns& discs,
+             const Pairs& xy, const Matrices2& whiten, const Mask& single, const Pairs& axes,
+             const Numbers& angle, const Matrices2& scale, const Numbers& sigma, const Mask& shaped,
+             const Mask& turned, const Covariances& information)
+        : discs_(discs),
+          columns_(xy, whiten, single, axes, angle, scale, sigma, shaped, turned, information),
+          fit_(bodies, exposures, observed(bodies.size(), exposures.size()),
+               reinterpret_cast<const ErrorMatrix*>(information.data())) {}
+
+    auto linearize(const EquationArray& headings) {
+        require_equal(fit_.n_turned(), {headings.shape(0)});
+        unlocked([&] { fit_.linearize(reinterpret_cast<const Equations*>(headings.data())); });
+        return std::make_tuple(copied(fit_.information(), {fit_.moving().size(), kErrors, kErrors}),
+                               copied(fit_.right(), {fit_.moving().size(), kErrors}));
+    }
+    bool step(const In<double, -1, 12>& steps, double small) {
+        require_equal(fit_.moving().size(), {steps.shape(0), fit_.right().size()});
+        return fit_.step(reinterpret_cast<const ErrorVector*>(steps.data()), small);
+    }
+    auto estimates() const {
+        const auto& bodies = fit_.estimates();
+        auto [R, to_R] = make({bodies.size(), 3, 3});
+        auto [vectors, to] = make({3, bodies.size(), 3});
+        for (size_t b = 0; b < bodies.size(); ++b) {
+            write(bodies[b].R, to_R + 9 * b);
+            write(bodies[b].p, to + 3 * b);
+            write(bodies[b].omega, to + 3 * (bodies.size() + b));
+            write(bodies[b].v, to + 3 * (2 * bodies.size() + b));
+        }
+        return std::make_tuple(R, vectors);
+    }
+    Out covariances(const Covariances& P) const {
+        require_equal(fit_.estimates().size(), {P.shape(0)});
+        auto [fitted, to] = make({P.shape(0), kErrors, kErrors});
+        std::copy_n(P.data(), P.size(), to);
+        fit_.write_covariances(reinterpret_cast<ErrorMatrix*>(to));
+        return fitted;
+    }
+    /// Of the centres: equations, weights and residuals.
+    auto centres() const {
+        const size_t n = discs_.frame.size();
+        auto [weights, to] = make({n});
+        std::copy_n(fit_.weights().data(), n, to);
+        return std::make_tuple(copied(fit_.equations(), {n, 2, kErrors + 1}), weights,
+                               copied(fit_.residuals(), {n, 2}));
+    }
+
+  private:
+    /// The numbers of the first rows of a vector of arrays.
+    template <class Row>
+    static Out copied(const std::vector<Row>& rows, std::initializer_list<size_t> shape) {
+        auto [array, to] = make(shape);
+        std::copy_n(rows.data(), *shape.begin(), reinterpret_cast<Row*>(to));
+        return array;
+    }
+    FitObservations observed(size_t n_bodies, size_t n_frames) const {
+        const auto& [xy, whiten, single, axes, angle, scale, sigma, shaped, turned, information] = columns_;
+        const Discs discs = discs_of(n_frames, n_bodies, discs_);
+        const size_t n = discs.size();
+        require_equal(n_bodies, {single.size(), information.shape(0)});
+        require_equal(n, {angle.size(), sigma.size(), shaped.size(), turned.size()});
+        return {{discs, columns<2>(xy, n), columns<4>(whiten, n), single.data()},
+                {discs, columns<2>(axes, n), angle.data(), columns<4>(scale, n), sigma.data()},
+                shaped.data(),
+                turned.data()};
+    }
+
+    DiscColumns discs_;
+    std::tuple<Pairs, Matrices2, Mask, Pairs, Numbers, Matrices2, Numbers, Mask, Mask, Covariances> columns_;
+    BodyFit fit_;
+};
 
 auto respond_arrays(const FramePoses& poses, const Index& camera, size_t n_cameras,
                     const EquationArray& equations, const Numbers& weights, const Numbers& rig_share,
@@ -171,6 +251,15 @@ void bind_poses(nb::module_& m) {
         .def("linearize_centres", &linearize_centres)
         .def("differentiate_by_camera", &differentiate_by_camera)
         .def("linearize_outlines", &linearize_outlines);
+    nb::class_<ArrayFit>(m, "BodyFit")
+        .def(nb::init<const BodyStates&, const CameraExposures&, const DiscColumns&, const Pairs&,
+                      const Matrices2&, const Mask&, const Pairs&, const Numbers&, const Matrices2&,
+                      const Numbers&, const Mask&, const Mask&, const Covariances&>())
+        .def("linearize", &ArrayFit::linearize)
+        .def("step", &ArrayFit::step)
+        .def("estimates", &ArrayFit::estimates)
+        .def("covariances", &ArrayFit::covariances)
+        .def("centres", &ArrayFit::centres);
     m.def("shears", &shears_of);
     m.def("respond", &respond_arrays);
     m.def("consider", &consider_arrays);

@@ -32,7 +32,6 @@ DISC_ARRAYS = FRAME, BODY, np.zeros((3, N)), ALONG_Z, np.full(N, 0.0625), np.ful
 SCALES, FOCAL, FALSE = np.tile(np.eye(2)[..., None], N), np.full(F, 800.0), np.zeros(B, bool)
 DETECTION_ARRAYS = FRAME, np.zeros((2, N)), SCALES, SCALES, np.ones(N), np.ones(N)
 VIEWPOINT_ARRAYS = np.arange(F), np.zeros((F, 3))
-EQUATIONS, STEPS = np.zeros((N, 2, 13)), np.zeros((B, 12))
 VIEWPOINTS = _core.Viewpoints(*VIEWPOINT_ARRAYS)
 POSES = _core.FramePoses(_core.BodyStates(*BODY_ARRAYS), _core.CameraExposures(*EXPOSURE_ARRAYS))
 MARKERS = _core.ExpectedMarkers(R, P, BODY, *DISC_ARRAYS[2:5])
@@ -69,8 +68,18 @@ CALLS = {
         lambda *given: _core.predict(_core.BodyStates(*given[:4]), *given[4:]),
         (*BODY_ARRAYS, P, np.full(B, 1 / 64), np.ones((B, 2)), FALSE),
     ),
-    "reweigh": (_core.reweigh, (EQUATIONS, BODY, P, STEPS, np.ones(N))),
-    "residuals": (_core.residuals, (EQUATIONS, BODY, STEPS)),
+    "BodyFit": (
+        lambda *given: _core.BodyFit(
+            _core.BodyStates(*given[:4]),
+            _core.CameraExposures(*given[4:8]),
+            _core.DiscColumns(*given[8:14]),
+            *given[14:-1],
+        ).linearize(given[-1]),
+        (
+            *(*BODY_ARRAYS, *EXPOSURE_ARRAYS, *DISC_ARRAYS, np.zeros((2, N)), SCALES, FALSE, *OUTLINES),
+            *(np.ones(N, bool), np.ones(N, bool), P, np.zeros((N, 2, 13))),
+        ),
+    ),
     "inverses": (_core.inverses, (P,)),
     "Viewpoints": (_core.Viewpoints, VIEWPOINT_ARRAYS),
     "densest_ranges": (
@@ -159,7 +168,7 @@ def test_no_detections_give_no_columns(name: str):
     assert all(0 in part.shape for part in numbers_of(function(*none)))
 
 
-@pytest.mark.parametrize("name", ["FramePoses", "predict", "reweigh", "residuals", "inverses"])
+@pytest.mark.parametrize("name", ["FramePoses", "predict", "inverses"])
 def test_no_bodies_give_no_rows(name: str):
     function, given = CALLS[name]
     assert all(0 in part.shape for part in numbers_of(function(*(a[:0].copy() for a in given))))
