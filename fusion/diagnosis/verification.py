@@ -17,7 +17,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, stdtrit
 
 from calib.rig.camera import Camera
 from calib.rig.precision_map import SIGMA_PX, FloorGrid, error_rows
@@ -239,13 +239,13 @@ class Verifier:
         sigma = float(np.sqrt(variance + (rig_sigma or 0.0) ** 2 + object_sigma**2))
         ratio, degrees = self._compare_claims(sightings, scale, place)
         tail = np.array([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-        low, high = (stats.chi2.ppf(tail, degrees) / degrees).tolist()
+        low, high = (chdtri(degrees, 1 - tail) / degrees).tolist()
         return Verification(
             frame_sets=self._finder.frame_sets,
             used=len(sightings),
             scale=scale,
             scale_sigma=sigma,
-            scale_margin=sigma * float(stats.t.ppf(tail[1], len(cells) - 1)),
+            scale_margin=sigma * float(stdtrit(len(cells) - 1, tail[1])),
             rig_sigma=rig_sigma,
             rms_mm=float(np.sqrt(lengths.squared_mm2.mean())),
             error_over_claim=ratio,

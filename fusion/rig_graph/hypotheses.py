@@ -16,7 +16,7 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri, exp1
 
 from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index, Mask
@@ -140,7 +140,7 @@ class Fit:
     def variance(self) -> float:
         """Of a whitened residual, by the median, not below 1."""
         known = self.squared[np.isfinite(self.squared)]
-        return max(1.0, float(np.median(known) / chi2.ppf(0.5, 2))) if len(known) else 1.0
+        return max(1.0, float(np.median(known) / chdtri(2, 0.5))) if len(known) else 1.0
 
     @property
     def misfit(self) -> float:
@@ -150,8 +150,9 @@ class Fit:
 
     def is_adequate(self) -> bool:
         """Whether the residuals are noise of any variance: a wrong model leaves more large ones."""
-        variance = float(np.median(np.nan_to_num(self.squared, nan=BEHIND)) / chi2.ppf(0.5, 2))
-        expected = chi2.expect(lambda x: np.log1p(max(1.0, variance) * x / _core.CAUCHY**2), (2,))
+        variance = float(np.median(np.nan_to_num(self.squared, nan=BEHIND)) / chdtri(2, 0.5))
+        rate = _core.CAUCHY**2 / (2 * max(1.0, variance))  # of the exponential distribution of squares of noise
+        expected = np.exp(rate) * exp1(rate)  # of log(1 + square)
         return bool(self._robust().mean() < ADEQUATE * expected)
 
     def _robust(self) -> Array:
@@ -246,7 +247,7 @@ def is_contradicted(none: Fit, n_cameras: int) -> bool:
     """Whether errors of the cameras explain more than chance: the score test (Rao 1948) of all of them together."""
     observed, gradient = none.reduced[:, :-1], none.reduced[:, -1]
     score = gradient @ np.linalg.solve(observed + np.diag(np.tile(FREE_SIGMA**-2, n_cameras)), gradient)
-    return bool(score > none.variance * chi2.isf(FALSE_ALARM, ERRORS * n_cameras))
+    return bool(score > none.variance * chdtri(ERRORS * n_cameras, FALSE_ALARM))
 
 
 def decide(fits: Sequence[Fit], n_cameras: int) -> Verdict:
@@ -258,7 +259,7 @@ def decide(fits: Sequence[Fit], n_cameras: int) -> Verdict:
     variance = min(f.variance for f in fits)
     score = {id(f): f.cost / variance + f.penalty for f in fits}
     best = min(fits, key=lambda f: score[id(f)])
-    limit = score[id(best)] + chi2.isf(FALSE_ALARM, CAUSES["pose"].stop)
+    limit = score[id(best)] + chdtri(CAUSES["pose"].stop, FALSE_ALARM)
     rivals = [
         f for f in fits if not (best.hypothesis.free <= f.hypothesis.free).all() and score[id(f)] < limit
     ]

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.rig.camera import Camera
 from calib.rig.camera_errors import ERRORS, with_errors
@@ -258,7 +258,7 @@ class RigMonitor:
             T = window.T.copy()
             T[k] = pose.matrix()
             known = fit(replace(window, T=T), Hypothesis.of(None, (), len(window.names)))
-            if known.cost - best.cost < best.variance * chi2.isf(FALSE_ALARM, 6):
+            if known.cost - best.cost < best.variance * chdtri(6, FALSE_ALARM):
                 camera = msgspec.structs.replace(self._cameras[name], T_world_cam=pose)
                 return ExtrinsicsCorrection(name, camera, has_returned=True)
         covariance = best.covariance(k)[:6, :6]

@@ -14,7 +14,7 @@ from itertools import compress
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
@@ -73,7 +73,7 @@ class _Sums:
         """Where the squared errors exceed their claims significantly."""
         expected = np.maximum(self.redundancy, 1e-9)
         degrees = expected**2 / (expected - self.rig + self.rig**2 / POSE_DEGREES)
-        bound = stats.chi2.isf(FALSE_ALARM, np.maximum(degrees, 1e-3)) / np.maximum(degrees, 1e-3)
+        bound = chdtri(np.maximum(degrees, 1e-3), FALSE_ALARM) / np.maximum(degrees, 1e-3)
         return (self.redundancy > MIN_REDUNDANCY) & (self.ratio() > np.maximum(CLAIM_RATIO, bound))
 
 

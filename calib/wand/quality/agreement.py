@@ -190,7 +190,7 @@ def _find_moved(a: CameraPoses, b: CameraPoses) -> tuple[str | None, float]:
 
 def _test(a: CameraPoses, b: CameraPoses) -> tuple[float, int, float]:
     """Return chi-square of the difference of the same cameras, its degrees of freedom and its probability."""
-    from scipy.stats import chi2 as distribution
+    from scipy.special import chdtrc
 
     difference = _differences(a, b, _align(a, b)).ravel()
     gauge = np.vstack([adjoint(invert(T)) for T in a.cameras])  # rigid motions of the world
@@ -200,7 +200,7 @@ def _test(a: CameraPoses, b: CameraPoses) -> tuple[float, int, float]:
     rest = np.linalg.svd(gauge)[0][:, gauge.shape[1] :]
     difference, covariance = rest.T @ difference, rest.T @ a.difference_covariance(b) @ rest
     squared, degrees = float(difference @ np.linalg.solve(covariance, difference)), len(difference)
-    return squared, degrees, float(distribution.sf(squared, degrees))
+    return squared, degrees, float(chdtrc(degrees, squared))
 
 
 def _align(a: CameraPoses, b: CameraPoses) -> Array:
