@@ -9,7 +9,7 @@ a fit counts both, and is chi-square if all claims hold (Bar-Shalom et al. 2001,
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.special import chdtri  # the inverse survival function of chi-square; scipy.stats takes long to import
+from scipy.special import chdtri  # the inverse survival function of chi-square
 
 from camera_node.foundation.arrays import Array, Index
 from fusion._core import CAUCHY, SLACK_PX

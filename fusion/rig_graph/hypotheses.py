@@ -151,8 +151,10 @@ class Fit:
     def is_adequate(self) -> bool:
         """Whether the residuals are noise of any variance: a wrong model leaves more large ones."""
         variance = float(np.median(np.nan_to_num(self.squared, nan=BEHIND)) / chdtri(2, 0.5))
-        rate = _core.CAUCHY**2 / (2 * max(1.0, variance))  # of the exponential distribution of squares of noise
-        expected = np.exp(rate) * exp1(rate)  # of log(1 + square)
+        rate = _core.CAUCHY**2 / (2 * max(1.0, variance))
+        expected = np.exp(rate) * exp1(
+            rate
+        )  # of log(1 + square), whose squares have an exponential distribution
         return bool(self._robust().mean() < ADEQUATE * expected)
 
     def _robust(self) -> Array:
