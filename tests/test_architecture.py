@@ -17,7 +17,6 @@ from tests.source_tree import PROGRAMS, imports, name_of, parse, python_files
 MAX_CHAIN = {"camera_node": 10, "calib": 10, "fusion": 13, "web": 10, "roundel": 10}
 SMALL = 60  # lines: such a module with one importer belongs into it
 SHARED_NAMES = {"errors.py", "detector.py"}  # each program's errors; `camera_node.detector` is a contract
-REPLACED = "fusion.monitoring."  # its modules keep their size until the rig graph replaces them
 COMMON_TYPES = {"Array", "Index", "Mask", "Grey"}  # camera_node/foundation/arrays.py defines them
 
 
@@ -63,7 +62,7 @@ def test_a_small_module_has_several_importers():
     assert_none(
         f"{module} has {lengths[module]} lines and one importer"
         for module, count in importers.items()
-        if count == 1 and lengths[module] < SMALL and not module.startswith(REPLACED)
+        if count == 1 and lengths[module] < SMALL
     )
 
 

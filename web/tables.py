@@ -173,7 +173,7 @@ def _advise(own_advice: str, health: CameraHealth | None) -> str:
         "not calibrated": not health.calibrated,
         "moved: excluded until it is recalibrated": health.excluded,
         "repeats an old image: excluded until it delivers new ones": health.frozen,
-        "its stamps jumped: excluded until they are corrected": health.clock == "excluded",
+        "its stamps may have jumped: robots in motion will show it": health.clock == "uncertain",
         f"its stamps are corrected by {health.clock_correction_ms:.1f} ms: check its clock": health.clock
         == "corrected",
         "two nodes use this name": health.duplicate_publisher,

@@ -3,13 +3,15 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from calib.rig.camera import Camera
-from camera_node.foundation.arrays import Array, Mask
+from camera_node.foundation.arrays import Array
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
+from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import Snapshot
-from fusion.monitoring.clocks.camera_clocks import CameraClocks
+from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.monitoring.frame_consistency import FrameConsistency
 from fusion.monitoring.frozen_images import FrozenImages
 from fusion.rig_graph.rig_monitor import RigMonitor
@@ -21,27 +23,25 @@ class CameraMonitors:
     Args:
         cameras: cameras of the rig; `check` and `place` change their poses.
         markers: of all robots.
-        single: (R,) robots with a single marker.
         densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
     """
 
-    def __init__(self, cameras: CameraArray, markers: MarkerTable, single: Mask, densities: Array) -> None:
-        self._cameras = cameras
-        self.clocks = CameraClocks(cameras, markers, single)
+    def __init__(self, cameras: CameraArray, markers: MarkerTable, densities: Array) -> None:
+        self._cameras, self._speed_m_s = cameras, 0.0
+        self.clocks = CameraClocks(cameras.names)
         self.frozen = FrozenImages(cameras, markers)
         self.consistency = FrameConsistency(cameras, markers)
         self.rig = RigMonitor(cameras, markers, densities)
 
     @property
     def withheld(self) -> set[str]:
-        """Cameras whose frames `admit` refuses: their clocks are unknown, or their images frozen."""
-        return self.clocks.excluded | self.frozen.names
+        """Cameras whose frames `admit` refuses: their images are frozen."""
+        return self.frozen.names
 
     def inherit(self, old: "CameraMonitors") -> None:
         """Continue with the same cameras and other robots."""
         self.clocks.inherit(old.clocks)
         self.frozen.inherit(old.frozen)
-        self.consistency.inherit(old.consistency)
         self.rig.inherit(old.rig)
 
     def admit(self, frame: CalibratedFrame, now: Snapshot | None) -> CalibratedFrame | None:
@@ -51,40 +51,31 @@ class CameraMonitors:
             frame: the next one of its camera.
             now: the robots at the last frame set; None before the first.
         """
+        if sigma_s := self.clocks.observe(frame):
+            self.rig.jump(frame.camera, sigma_s)
+        if now is not None and now.tracked.any():
+            self._speed_m_s = float(np.linalg.norm(now.states.v[now.tracked], axis=1).max())
         admitted = self.clocks.admit(frame)
         return None if admitted is None or self.frozen.is_frozen(admitted, now) else admitted
 
     def used(self, frame_set: FrameSet) -> FrameSet:
-        """The frame set without the frames of moved cameras."""
-        excluded = self.rig.excluded
+        """The frame set without the frames of moved cameras, and of those whose time is not known."""
+        excluded = self.rig.excluded | self.clocks.uncertain(self._speed_m_s)
         if not excluded:
             return frame_set
         return replace(frame_set, frames=tuple(f for f in frame_set.frames if f.camera not in excluded))
-
-    def is_doubtful(self, t_ns: int) -> bool:
-        """Whether a camera contradicted the others just now, or may be at fault."""
-        return bool(self.consistency.in_doubt(t_ns)) or self.rig.is_doubtful
-
-    def observe(
-        self, now: Snapshot, detections: DetectionTable, assignments: Assignments, is_doubtful: bool
-    ) -> None:
-        """Compare the clocks in a frame set; see `CameraClocks.observe`."""
-        self.clocks.observe(now, detections, assignments, is_doubtful)
 
     def check_extrinsics(
         self, frame_set: FrameSet, now: Snapshot, recalibrates: bool, is_doubtful: bool
     ) -> tuple[ExtrinsicsCorrection, ...]:
         """Exclude moved cameras, apply recalibrated poses and correct clocks; see `RigMonitor.check`."""
         corrections = self.rig.check(frame_set, now, recalibrates, is_doubtful)
-        if (clock := self.rig.take_clock()) is not None:
-            self.clocks.correct(*clock)
-            self.consistency.forget(clock[0])
+        if (departure := self.rig.take_departure()) is not None:
+            self.clocks.correct(departure, now.t_ns)
         for correction in corrections:
             if correction.camera is not None:
                 self._cameras.place(correction.name, correction.camera)
                 self._cameras.state_errors(correction.rig)
-                self.consistency.forget(correction.name)
-                self.clocks.rebase()
         return corrections
 
     def place(self, name: str, camera: Camera, pinned: bool) -> None:

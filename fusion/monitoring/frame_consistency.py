@@ -22,7 +22,6 @@ MIN_DETECTED = 0.6  # of the usual number: a camera that sees little contradicts
 CONTRADICTS = 0.5  # of the expected markers: with fewer of them assigned, a frame contradicts the robots
 MIN_EXPECTED = 6  # markers, from which a frame is judged
 MIN_OTHERS = 2  # other cameras that agree
-HELD_NS = 700_000_000  # after a contradiction, in which its camera is in doubt: the shortest window of the rig graph
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,14 +29,12 @@ class AssignedFrames:
     """Frames of a frame set with their assignments before the update.
 
     Attributes:
-        t_ns: time of the frame set.
         states: predicted robots.
         tracked: (R,) robots whose detections were assigned.
         detections: of all frames.
         assignments: of the detections.
     """
 
-    t_ns: int
     states: States
     tracked: Mask
     detections: DetectionTable
@@ -45,7 +42,7 @@ class AssignedFrames:
 
 
 class FrameConsistency:
-    """The usual number of assigned detections of each camera, and when it last contradicted the others.
+    """The usual number of assigned detections of each camera, whether a frame contradicts the others.
 
     Args:
         cameras: cameras of the rig.
@@ -56,19 +53,6 @@ class FrameConsistency:
         self._cameras, self._markers = cameras, markers
         n = len(cameras.names)
         self._usual, self._learned = np.zeros(n), np.zeros(n, np.intp)
-        self._contradicted_ns: dict[str, int] = {}
-
-    def in_doubt(self, t_ns: int) -> set[str]:
-        """Cameras that contradicted the others shortly before `t_ns`."""
-        return {name for name, at_ns in self._contradicted_ns.items() if 0 <= t_ns - at_ns < HELD_NS}
-
-    def forget(self, name: str) -> None:
-        """A camera has another pose or clock by now."""
-        self._contradicted_ns.pop(name, None)
-
-    def inherit(self, old: "FrameConsistency") -> None:
-        """Continue with the same cameras and other robots."""
-        self._contradicted_ns = old._contradicted_ns
 
     def contradicting(self, given: AssignedFrames) -> Index:
         """Rows of the frames that contradict the robots while two other cameras agree with them."""
@@ -84,8 +68,6 @@ class FrameConsistency:
             for row in np.flatnonzero(suspicious).tolist():
                 wrong[row] = self._contradicts(given, row)
         self._learn(frames[~wrong], assigned[~wrong].astype(float))
-        for k in frames[wrong].tolist():
-            self._contradicted_ns[self._cameras.names[k]] = given.t_ns
         return np.flatnonzero(wrong)
 
     def _contradicts(self, given: AssignedFrames, row: int) -> bool:

@@ -320,7 +320,7 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
     skipped: dict[
         str, int
     ] = {}  # frames of the last `SKIPPED_S` that were not used: refused or late, by reason
-    clock: str = "correct"  # or "excluded" while its stamps are wrong by an unknown time, or "corrected"
+    clock: str = "correct"  # or "corrected", or "uncertain" while its stamps may have jumped
     clock_correction_ms: float = 0.0  # added to its stamps
     clock_sigma_ms: float = 0.0  # standard deviation of the correction
 

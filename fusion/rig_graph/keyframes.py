@@ -8,7 +8,7 @@ pose is where the search of a hypothesis begins.
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -113,6 +113,19 @@ class Keyframes:
         if keyframe is not None:
             self.kept.append(keyframe)
         return keyframe is not None
+
+    def retime(self, name: str, offset_s: Callable[[int], float]) -> None:
+        """Correct the stamps of a camera by an offset, seconds at a time in ns."""
+
+        def retimed(frame: CalibratedFrame) -> CalibratedFrame:
+            shift_ns = round(1e9 * offset_s(frame.t_ns)) if frame.camera == name else 0
+            return replace(frame, t_ns=frame.t_ns + shift_ns) if shift_ns else frame
+
+        for k, keyframe in enumerate(self.kept):
+            views = tuple(replace(view, frame=retimed(view.frame)) for view in keyframe.views)
+            self.kept[k] = replace(keyframe, views=views)
+        for k, pending in enumerate(self._pending):
+            self._pending[k] = replace(pending, frames=tuple(map(retimed, pending.frames)))
 
     def _keyframe(self, frame_set: FrameSet) -> Keyframe | None:
         """The robots of a frame set with mean velocities around it, which stamps of one frame do not change."""

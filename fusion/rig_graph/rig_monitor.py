@@ -34,12 +34,15 @@ from fusion.model.frames import FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import Snapshot
 from fusion.protocol.pose_messages import Contradiction
+from fusion.rig_graph.clock_walk import ClockWalk, Departure
 from fusion.rig_graph.hypotheses import (
+    CAUSES,
     FALSE_ALARM,
     Fit,
     Hypothesis,
     Verdict,
     Window,
+    about_clocks,
     fit,
     judge,
     retract,
@@ -90,8 +93,11 @@ class RigMonitor:
         self._checked_ns = self._revision = self._n_undecided = 0
         self._pause_ns = 0  # after the last job
         self._is_contradicted = False
-        self._clock: tuple[str, float, float] | None = None
-        self._clocks: list[tuple[str, float, float]] = []  # the last verdicts in a row
+        self._walk = ClockWalk(len(cameras.names))
+        self._departure: Departure | None = None
+        self._given: tuple[Keyframe, ...] = ()  # to the last job
+        self._measured_ns = 0  # of the last keyframe that the walk contains
+        self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._was_doubtful = False
         self.widening, self._claim_m = 1.0, 0.0  # a detection's claimed error at its robot, metres
         self.executor: Executor | None = None
@@ -103,7 +109,7 @@ class RigMonitor:
     def inherit(self, old: "RigMonitor") -> None:
         """Continue with the same cameras and other robots."""
         self.inherit_poses(old)
-        self.excluded, self.executor = old.excluded, old.executor
+        self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
 
     def inherit_poses(self, old: "RigMonitor") -> None:
         """The poses that another monitor of the same cameras knows, and those that a user confirmed."""
@@ -143,15 +149,18 @@ class RigMonitor:
             ),
         )
 
-    def take_clock(self) -> tuple[str, float, float] | None:
-        """A camera whose clock alone explains the last keyframes: true capture time minus stamp, and sigma, seconds.
-
-        Its stamps are corrected from now on, so that the keyframes are forgotten.
-        """
-        found, self._clock = self._clock, None
+    def take_departure(self) -> Departure | None:
+        """The clock that departs from the others, which is corrected from now on."""
+        found, self._departure = self._departure, None
         if found is not None:
-            self._use(found[0])
+            self._keyframes.retime(self._cameras.names[found.camera], found.at)
+            self._job = None
         return found
+
+    def jump(self, name: str, sigma_s: float) -> None:
+        """The stamps of a camera jumped and are corrected with this standard deviation, or may have jumped so far."""
+        self._walk.jump(self._cameras.index[name], sigma_s)
+        self._forget()
 
     def check(
         self, frame_set: FrameSet, now: Snapshot, recalibrates: bool, is_doubtful: bool = False
@@ -179,7 +188,8 @@ class RigMonitor:
             self._checked_ns = now.t_ns
             self._revision = self._cameras.revision
             given = self._cameras.as_dict()  # of this moment
-            job = partial(judge_latest, tuple(kept), given, self._markers, self._densities)
+            self._given = tuple(kept)
+            job = partial(judge_latest, self._given, given, self._markers, self._densities)
             self._job = _done(job) if self.executor is None else self.executor.submit(job)
         if self._job is None or not self._job.done():
             return ()
@@ -199,7 +209,7 @@ class RigMonitor:
 
     def _act(self, window: Window, verdict: Verdict, recalibrates: bool) -> tuple[ExtrinsicsCorrection, ...]:
         names = tuple(window.names[k] for k in verdict.cameras)
-        self._note_clock(names[0], verdict) if verdict.cause == "clock" else self._clocks.clear()
+        self._note_clocks(window, verdict)
         self._is_contradicted = bool(names)
         self.widening = verdict.misfit if names else 1.0
         self._claim_m = _claim_m(window)
@@ -226,14 +236,24 @@ class RigMonitor:
             self._use(name)
         return tuple(ExtrinsicsCorrection(name, self._cameras[name], has_returned=True) for name in names)
 
-    def _note_clock(self, name: str, verdict: Verdict) -> None:
-        """Correct a clock once several verdicts in a row agree on it: a robot's own motion may look like one."""
-        k, best = verdict.cameras[0], verdict.fit
-        self._clocks.append((name, float(best.errors[k, 6]), float(np.sqrt(best.covariance(k)[6, 6]))))
-        if len({clock[0] for clock in self._clocks}) > 1:
+    def _note_clocks(self, window: Window, verdict: Verdict) -> None:
+        """Add a window that contradicts no pose and no lens to what is known of the clocks.
+
+        A jump of a clock is believed once several verdicts in a row agree on it: a robot's own motion may look like
+        one.
+        """
+        self._clocks = [*self._clocks, *verdict.cameras] if verdict.cause == "clock" else []
+        if len(set(self._clocks)) > 1:
             self._clocks = self._clocks[-1:]
-        if len(self._clocks) >= CONFIRMED:
-            self._clock = self._clocks[-1]
+        times = [keyframe.t_ns for keyframe in self._given[-1 - int(window.keyframe.max()) :]]
+        if verdict.cause == "clock" and len(self._clocks) >= CONFIRMED:
+            k = verdict.cameras[0]
+            self._walk.jump(k, abs(float(verdict.fit.errors[k, CAUSES["clock"]][0])))
+        elif verdict.cameras or self.excluded or times[0] <= self._measured_ns:
+            return
+        self._measured_ns = times[-1]
+        self._walk.update(sum(times) // len(times), *about_clocks(verdict.fit, window.prior))
+        self._departure = self._walk.take_departure()
 
     def _note_undecided(self, names: tuple[str, ...]) -> None:
         """Log cameras that contradict each other when that begins, and when it ends."""

@@ -233,7 +233,7 @@ class TrackingPipeline:
         return self.tracker.admit(frame) if self.tracker else frame
 
     def withheld_cameras(self) -> set[str]:
-        """Cameras whose frames are not used: their clocks are unknown, or their images frozen."""
+        """Cameras whose frames are not used: their images are frozen."""
         return self.tracker.monitors.withheld if self.tracker else set()
 
     def status(self) -> PipelineStatus:

@@ -14,7 +14,7 @@ import numpy as np
 
 from camera_node.foundation.logs import about
 from fusion.model.limits import Limits
-from fusion.monitoring.clocks.camera_clocks import ClockHealth
+from fusion.monitoring.camera_clocks import ClockHealth
 from fusion.protocol.pose_messages import (
     SKIPPED_S,
     CameraHealth,

@@ -49,7 +49,6 @@ class Update:
         prediction, tracked: see `AssociatedFrames`.
         detections: of all cameras that are not excluded.
         assignments: of the detections, with residuals.
-        associated: the assignments before those were dropped that do not fit.
         summary: of the assignments.
         poses: by row of the robot; acquisition does not change these.
     """
@@ -59,7 +58,6 @@ class Update:
     tracked: Mask
     detections: DetectionTable
     assignments: Assignments
-    associated: Assignments
     summary: ObservationSummary
     poses: dict[int, RobotPose]
 
@@ -100,7 +98,7 @@ class Tracker:
         self.acquisition = Acquisition(self.cameras, self.estimator)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
-        self.monitors = CameraMonitors(self.cameras, self.table.markers, self.table.single, densities)
+        self.monitors = CameraMonitors(self.cameras, self.table.markers, densities)
         self.claims = ClaimCheck(self.estimator, self.table.markers, self.table.names)
         self.geometry = GeometryCheck(self.table.names, self.table.single)
         diameters = np.array([robot.diameter_m for robot in robots.values()])
@@ -178,7 +176,6 @@ class Tracker:
             tracked,
             detections,
             assignments,
-            all_assigned,
             summary,
             poses,
         )
@@ -188,10 +185,6 @@ class Tracker:
         self.sizes.observe(self.table.states, update.detections, update.assignments)
         self.claims.observe(update.prediction, self.table.states, update.detections, update.assignments)
         update, found = self._acquire(update)
-        table = self.table
-        now = Snapshot(update.t_ns, table.states, table.tracked)
-        is_doubtful = self.robust.is_doubtful or self.monitors.is_doubtful(update.t_ns)
-        self.monitors.observe(now, update.detections, update.associated, is_doubtful)
         unlabeled = self._track_unlabeled(update, found.markers)
         return self._report(update, unlabeled, found.crowded)
 
@@ -232,7 +225,7 @@ class Tracker:
         association = associated.association
         detections, assignments = association.collect(frame_set)
         states, tracked = associated.prediction.states, associated.tracked
-        given = AssignedFrames(frame_set.t_ns, states, tracked, detections, assignments)
+        given = AssignedFrames(states, tracked, detections, assignments)
         wrong = set(self.monitors.consistency.contradicting(given).tolist())
         if not wrong:
             return detections, assignments
@@ -259,9 +252,7 @@ class Tracker:
     ) -> Assignments:
         """Update the states of the robots; returns the assignments that fit, with residuals."""
         prediction, tracked = associated.prediction, associated.tracked
-        given = AssignedFrames(
-            associated.association.t_ns, prediction.states, tracked, detections, assignments
-        )
+        given = AssignedFrames(prediction.states, tracked, detections, assignments)
         fitted = self.robust.update(prediction, detections, assignments.select(self.own.are_own(given)))
         self.table.states = fitted.states
         self.rig_response.update(fitted, self.robust.added_px2)

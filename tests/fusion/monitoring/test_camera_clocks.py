@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from fusion.model.frames import MAX_CLOCK_ERROR_S, clock_sigma_s
-from fusion.monitoring.clocks.stamp_check import StampCheck
 from tests.benchmarks.fusion_load import Load
 from tests.fusion.clock_faults import GRACE_S, Outcome, drift, fuse, inaccurate, step
 
 LOAD = Load(robots=3, cameras=4, hz=30.0, speed_m_s=1.0, crossing=True)
 FAULT_S, DURATION_S = 2.0, 4.5
+PERIOD_S = 1 / LOAD.hz  # a line has the time of the frame set before
 REPORTED_S, RECOVERED_S = 1.0, 5.0  # the goals of issue 16
 
 
@@ -26,20 +26,21 @@ def require_harmless(outcome: Outcome, faulty: dict) -> None:
 
 @pytest.mark.parametrize("step_ms", [10, -25, 50, 500, -1000])
 def test_a_clock_that_jumps_is_reported_and_corrected(step_ms: float):
-    """In 120 ms the arrival of a frame shows the jump and the robots its size; sigma of a step is below 1 ms."""
+    """The first frame shows the jump and its size."""
     faulty = {"cam1": step(FAULT_S, step_ms * 1e-3)}
     outcome = fuse(LOAD, DURATION_S, faulty)
     require_harmless(outcome, faulty)
-    assert FAULT_S < outcome.reported_s("cam1") < FAULT_S + REPORTED_S
+    assert FAULT_S - PERIOD_S < outcome.reported_s("cam1") < FAULT_S + REPORTED_S
     assert outcome.in_use_since_s("cam1") < FAULT_S + RECOVERED_S
     (line,) = [line for _, line in outcome.log]
-    corrected_ms = float(line.split("corrected by ")[1].split()[0])
+    corrected_ms = float(line.split("now by ")[1].split()[0])
     assert corrected_ms == pytest.approx(-step_ms, abs=1.0)
 
 
 @pytest.mark.parametrize("step_ms", [25, -25])
 def test_a_recording_without_arrival_times_shows_the_same(step_ms: float):
-    """As `fusion run` reads from CSV and frames: each frame arrives at its own stamp."""
+    """As `fusion run` reads from CSV and frames: each frame arrives at its own stamp. A step back is certain, one ahead
+    may be a pause: the robots decide."""
     faulty = {"cam1": step(FAULT_S, step_ms * 1e-3)}
     outcome = fuse(LOAD, DURATION_S, faulty, jitter_s=None)
     require_harmless(outcome, faulty)
@@ -121,20 +122,33 @@ def test_the_bound_of_a_clock_error_is_bounded():
         assert clock_sigma_s(absurd) == pytest.approx(MAX_CLOCK_ERROR_S / np.sqrt(3))
 
 
-@pytest.mark.parametrize(("jump_ms", "delay_ms", "found"), [(25, 0, True), (-25, 0, True), (0, 40, False)])
-def test_a_late_frame_is_no_jump(jump_ms: float, delay_ms: float, found: bool):
-    """A slow network leaves the intervals between the stamps as they are. A frame that arrives too early is a jump for
-    certain, one that arrives late only with the next one."""
-    check, rng = StampCheck(), np.random.default_rng(1)
-    for k in range(40):
-        lag_ns = 10_000_000 + round(rng.exponential(1e6))
-        assert not check.has_jumped(k * 33_333_333, k * 33_333_333 + lag_ns)
-    t_ns = 40 * 33_333_333
-    error_ns, lag_ns = round(jump_ms * 1e6), 10_500_000 + round(delay_ms * 1e6)
-    jumped = [check.has_jumped(t + error_ns, t + lag_ns) for t in (t_ns, t_ns + 33_333_333)]
-    assert any(jumped) == found
-    assert jumped[0] == (jump_ms > 0)
-    if found:
-        jump_ns = check.change_ns()
-        assert check.is_timed
-        assert jump_ns == pytest.approx(jump_ms * 1e6, abs=5e6)  # exponential lags: mean 1 ms
+@pytest.mark.parametrize("step_s", [0.5, -0.1])
+def test_a_jump_that_all_cameras_share_harms_no_pose(step_s: float):
+    """Before: all were excluded, and without a frame set no search brought them back. A robot that stands is where it
+    was at any time."""
+    load = Load(robots=1, cameras=4, hz=30.0, speed_m_s=0.0)
+    outcome = fuse(load, 3.5, dict.fromkeys(load.rig, step(2.0, step_s)))
+    assert outcome.wrong(2.0 + GRACE_S) == []
+    assert all(np.isfinite(outcome.reported_s(name)) for name in load.rig)
+    assert all(outcome.in_use_since_s(name) < 2.0 for name in load.rig)
+    assert all(max(times) > 2.9 for times in outcome.used.values())
+
+
+def test_two_cameras_that_jump_differently_come_back():
+    """No frame set remains that could judge them: their stamps and arrivals do."""
+    load = Load(robots=1, cameras=2, hz=30.0, speed_m_s=0.0)
+    outcome = fuse(load, 5.0, {"cam0": step(2.0, 0.1), "cam1": step(2.0, -0.15)})
+    assert outcome.wrong(2.0 + GRACE_S) == []
+    for name in load.rig:
+        assert outcome.reported_s(name) < 4.5
+        assert max(outcome.used[name]) > 4.8
+
+
+@pytest.mark.parametrize("step_ms", [25.0, pytest.param(-25.0, marks=pytest.mark.slow)])
+def test_no_pose_is_wrong_after_a_step_that_arrivals_hide(step_ms: float):
+    """Before: poses were up to 0.4 m wrong for a second, until motion contradicted the stamps."""
+    outcome = fuse(LOAD, 4.5, {"cam1": step(2.5, step_ms * 1e-3)}, jitter_s=0.05)
+    assert outcome.wrong(2.5 + GRACE_S) == []
+    assert outcome.moves == []
+    assert 2.5 - PERIOD_S < outcome.reported_s("cam1") < 3.5
+    assert outcome.in_use_since_s("cam1") < 4.5

@@ -44,13 +44,12 @@ class Pipeline:
         frame = self.ingest.receive(
             encode(message), KEYS.detections(message.camera), received_ns, self.arena.cameras
         )
-        admitted = self.tracker.monitors.clocks.admit(frame) if frame is not None else None
+        admitted = self.tracker.admit(frame) if frame is not None else None
         if admitted is not None:
             self.synchronizer.add(admitted)
         elif frame is not None:
             self.synchronizer.ignore(frame.camera)
-            if frame.camera not in self.tracker.monitors.clocks.excluded:
-                self.statistics.count_fault("implausible time", frame.camera)
+            self.statistics.count_fault("implausible time", frame.camera)
         results = []
         for frame_set in self.synchronizer.take(received_ns):
             results.append(self.tracker.track(frame_set))

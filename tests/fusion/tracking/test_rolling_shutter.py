@@ -31,9 +31,8 @@ def position_error(readout_s: float, uses_rows: bool = True) -> float:
         synchronizer.add(frame if uses_rows else replace(frame, readout_s=0.0))
         for frame_set in synchronizer.take(frame.t_ns):
             tracker.track(frame_set)
-            assert not (
-                uses_rows and (tracker.check_extrinsics(frame_set) or tracker.monitors.clocks.excluded)
-            )
+            moves, clocks = tracker.check_extrinsics(frame_set), tracker.monitors.clocks.health().values()
+            assert not (uses_rows and (moves or any(clock.state != "correct" for clock in clocks)))
             if Arena.seconds(frame_set.t_ns) > DRIVING_S:
                 assert tracker.table.tracked.all()
                 truth = np.array([arena.truth(name, frame_set.t_ns)[1] for name in ROBOTS])

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Corrects the stamps of cameras whose clocks jump or drift, and states how well they are known.
+
+    the next frame of a camera  -> `StampCheck`: stamps jumped      -> corrected from this frame on
+                                                 they may have      -> their standard deviation grows by the jump
+    the rig graph's keyframes   -> offsets between the cameras      -> corrected where significant
+
+A camera is always used, with the standard deviation of its clock as noise along the motion of its detections.
+See docs/design/time_offsets.md.
+"""
+
+import logging
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from camera_node.foundation.logs import about
+from fusion.model.frames import CalibratedFrame
+from fusion.monitoring.stamp_check import StampCheck
+from fusion.rig_graph.clock_walk import Departure
+
+log = logging.getLogger("fusion")
+ClockState = Literal["correct", "uncertain", "corrected"]
+REPORTED_S = 0.0005  # smallest correction that is reported; later ones when it has doubled
+MAX_MOTION_M = 0.005  # of a robot in the standard deviation of a camera's clock, so that it locates the robot
+MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
+
+
+@dataclass(frozen=True, slots=True)
+class ClockHealth:
+    """A camera's clock: state, correction of its stamps in ms, and the standard deviation of the correction."""
+
+    state: ClockState = "correct"
+    offset_ms: float = 0.0
+    sigma_ms: float = 0.0
+
+
+@dataclass(slots=True)
+class _Clock:
+    """One camera.
+
+    Attributes:
+        check: of its stamps.
+        correction_s, sigma_s: added to its stamps at `since_ns`, and the standard deviation.
+        rate, since_ns: by which that grows, and a time of the camera's.
+        reported_s: the correction that was last reported.
+    """
+
+    check: StampCheck
+    correction_s: float = 0.0
+    sigma_s: float = 0.0
+    rate: float = 0.0
+    since_ns: int = 0
+    reported_s: float = 0.0
+
+    def at(self, t_ns: int) -> float:
+        """The correction at a time, s."""
+        return self.correction_s + self.rate * (t_ns - self.since_ns) * 1e-9
+
+    @property
+    def health(self) -> ClockHealth:
+        known_s = max(REPORTED_S, abs(self.correction_s))
+        state = "uncertain" if self.sigma_s > known_s else "corrected" if known_s > REPORTED_S else "correct"
+        return ClockHealth(state, 1e3 * self.correction_s, 1e3 * self.sigma_s)
+
+
+class CameraClocks:
+    """The clocks of all cameras of a rig.
+
+    Args:
+        names: of the cameras.
+    """
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self._names, self._clocks = names, {name: _Clock(StampCheck()) for name in names}
+
+    def health(self) -> dict[str, ClockHealth]:
+        """By camera."""
+        return {name: clock.health for name, clock in self._clocks.items()}
+
+    def uncertain(self, speed_m_s: float) -> set[str]:
+        """Cameras whose time is not known well enough to locate robots at this speed, while two others are."""
+        found = {name for name, clock in self._clocks.items() if clock.sigma_s * speed_m_s > MAX_MOTION_M}
+        return found if len(self._clocks) > len(found) + 1 else set()
+
+    def inherit(self, old: "CameraClocks") -> None:
+        """Continue with the clocks of the same cameras."""
+        self._clocks = old._clocks
+
+    def reset(self, name: str) -> None:
+        """Forget the clock of a camera that has another calibration."""
+        self._clocks[name] = _Clock(StampCheck())
+
+    def observe(self, frame: CalibratedFrame) -> float:
+        """Take the stamp and the arrival of the next frame of a camera; the standard deviation of its clock, s, if its
+        stamps jumped, or may have, else 0."""
+        name, clock = frame.camera, self._clocks[frame.camera]
+        jump = clock.check.add(frame.t_ns, frame.received_ns)
+        if jump is None:
+            return 0.0
+        sigma_s = 1e-9 * jump.sigma_ns
+        if not jump.ahead_ns:
+            clock.sigma_s = math.hypot(clock.sigma_s, sigma_s)
+            return sigma_s
+        clock.correction_s, clock.since_ns = clock.at(frame.t_ns) - 1e-9 * jump.ahead_ns, frame.t_ns
+        clock.reported_s, clock.sigma_s = clock.correction_s, sigma_s
+        message = "camera %s: its stamps jumped by %.0f ms; they are corrected, now by %.1f ms"
+        log.warning(message, name, 1e-6 * jump.ahead_ns, 1e3 * clock.at(frame.t_ns), extra=about(name))
+        return sigma_s
+
+    def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
+        """A frame in corrected time; None if that time is in the future."""
+        clock = self._clocks[frame.camera]
+        if clock.since_ns or clock.sigma_s:
+            sigma_s = math.hypot(frame.clock_sigma_s, clock.sigma_s)
+            t_ns = frame.t_ns + round(1e9 * clock.at(frame.t_ns))
+            frame = replace(frame, t_ns=t_ns, clock_sigma_s=sigma_s)
+        return None if frame.t_ns > frame.received_ns + MAX_AHEAD_NS else frame
+
+    def correct(self, departure: Departure, now_ns: int) -> None:
+        """Correct the clock of a camera that departs from the others."""
+        name = self._names[departure.camera]
+        clock, t_ns = self._clocks[name], departure.t_ns
+        clock.correction_s, clock.since_ns = clock.at(t_ns) + departure.offset_s, t_ns
+        clock.rate, clock.sigma_s = clock.rate + departure.rate, departure.sigma_s
+        if abs(clock.correction_s - clock.reported_s) < REPORTED_S + abs(clock.reported_s):
+            return
+        clock.reported_s = clock.correction_s
+        message = "camera %s: its clock drifts from the others by %.0f ppm; its stamps are corrected, now by %.1f ms"
+        log.warning(message, name, -1e6 * clock.rate, 1e3 * clock.at(now_ns), extra=about(name))

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Finds jumps of a camera's stamps by two measurements of each frame; docs/design/time_offsets.md, section 2.
+
+The interval to the stamp before is free of the delays of arrivals: of a camera with a constant rate it is a multiple of
+the usual one, else the stamps jumped or the camera paused. The lag, arrival minus stamp, shows which: stamps that jump
+ahead by J lower it by J, and no frame arrives before it was sent; an interval below the usual one is no pause.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+from statistics import median
+
+HISTORY, LEARNED = 64, 16  # frames of a camera, and how many of them define what is usual
+MIN_JUMP_NS = 4_000_000  # of lags, which vary with the time of detection
+EARLY_SHARE = 0.25  # of the usual lag above the smallest, by which the next one may be smaller still
+MIN_IRREGULAR = 0.1  # of the interval between frames
+MAX_SWAPPED = 12  # intervals by which a frame may overtake another
+
+
+@dataclass(frozen=True, slots=True)
+class StampJump:
+    """By how much stamps jumped ahead, and the standard deviation; 0, and the possible jump, if they may have."""
+
+    ahead_ns: float
+    sigma_ns: float
+
+
+class StampCheck:
+    """The last stamps and lags of one camera."""
+
+    def __init__(self) -> None:
+        self._stamps: deque[int] = deque(maxlen=LEARNED)
+        self._lags: deque[int] = deque(maxlen=HISTORY)
+
+    def add(self, t_ns: int, received_ns: int) -> StampJump | None:
+        """Whether the stamp of the next frame shows a jump, or may; the frames before it are forgotten then."""
+        lag = received_ns - t_ns
+        jump = self._jump(t_ns, lag) if len(self._lags) >= LEARNED else None
+        if jump is not None:
+            self._stamps.clear()
+            self._lags.clear()
+        self._stamps.append(t_ns)
+        self._lags.append(lag)
+        return jump
+
+    def _jump(self, t_ns: int, lag: int) -> StampJump | None:
+        stamps = sorted(self._stamps)
+        steps = [after - before for before, after in pairwise(stamps)]
+        interval, since = max(1.0, median(steps)), t_ns - stamps[-1]
+        if abs(since - interval) <= MIN_IRREGULAR * interval:
+            return None  # the next frame; the lags of queued ones fall
+        low, usual, high = min(self._lags), median(self._lags), max(self._lags)
+        least, most = low - lag - MIN_JUMP_NS - EARLY_SHARE * (usual - low), high - lag + MIN_JUMP_NS
+        if low == high == lag:  # a recording without arrival times
+            least, most = -math.inf, math.inf
+        is_early, is_late = least > 0, most < 0 and since < interval
+        if not all(_is_multiple(step, interval) for step in steps):
+            return StampJump(usual - lag, high - low + MIN_JUMP_NS) if is_early else None
+        if not is_early and self._is_regular(t_ns, interval):
+            return None
+        longest = since - interval  # jump ahead; a smaller one if frames are missing too
+        precision = max(abs(step - round(step / interval) * interval) for step in steps) + 1
+        if is_late:
+            return StampJump(longest, precision) if longest >= least else None
+        if least == -math.inf:
+            return StampJump(0.0, max(since % interval, -since % interval))
+        ahead = least + (since - least) % interval
+        if is_early and ahead >= MIN_JUMP_NS:
+            return StampJump(ahead, precision if ahead + interval > min(most, longest) else interval)
+        return (
+            StampJump(0.0, max(since % interval, -since % interval)) if ahead <= min(most, longest) else None
+        )
+
+    def _is_regular(self, t_ns: int, interval: float) -> bool:
+        """Whether a stamp follows the others by multiples of the usual interval, or is that of a swapped frame."""
+        since = t_ns - max(self._stamps)
+        is_new = min(abs(t_ns - stamp) for stamp in self._stamps) > MIN_IRREGULAR * interval
+        return _is_multiple(since, interval) and is_new and since > -(MAX_SWAPPED + 0.5) * interval
+
+
+def _is_multiple(step: float, interval: float) -> bool:
+    n = round(step / interval)
+    return n != 0 and abs(step - n * interval) <= MIN_IRREGULAR * interval

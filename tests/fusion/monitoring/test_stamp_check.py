@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Jumps of stamps: found in their first frame, with the right size; frames that are late, lost or swapped are none."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from fusion.monitoring.stamp_check import HISTORY, StampCheck, StampJump
+
+PERIOD_NS, LAG_NS = 33_333_333, 12_000_000
+N_RUNS = 20
+SINCE = 60  # frames after the event
+# Lags of 50 ms show a jump in one frame of many, if at all: a wrong decision needs a lag below all of 64 earlier ones.
+MAX_WRONG = 2
+
+
+def jumps(captured: Iterable[int], stamps: Iterable[int], jitter_ms: float, seed: int) -> list[StampJump]:
+    """Those of frames in order of arrival; the varying part of the lag has an exponential distribution."""
+    rng, check = np.random.default_rng(seed), StampCheck()
+    frames = [
+        (at + LAG_NS + round(rng.exponential(jitter_ms * 1e6)), stamp)
+        for at, stamp in zip(captured, stamps, strict=True)
+    ]
+    found = (check.add(stamp, received_ns) for received_ns, stamp in sorted(frames))
+    return [jump for jump in found if jump is not None]
+
+
+def regular(n: int = HISTORY + SINCE) -> list[int]:
+    return [k * PERIOD_NS for k in range(n)]
+
+
+def stepped(step_ms: float) -> list[int]:
+    return [t + round(step_ms * 1e6) * (k >= HISTORY) for k, t in enumerate(regular())]
+
+
+@pytest.mark.parametrize("step_ms", [25.0, -25.0, 400.0, -400.0, 500.0, -1000.0, 1e3 / 15])
+def test_a_jump_is_found_with_its_size(step_ms: float):
+    """Also by a multiple of the interval, where only the lag shows it."""
+    for seed in range(N_RUNS):
+        (jump,) = jumps(regular(), stepped(step_ms), 1.0, seed)
+        assert jump.ahead_ns == pytest.approx(step_ms * 1e6, abs=10)
+        assert jump.sigma_ns < 100
+
+
+@pytest.mark.parametrize("step_ms", [25.0, -25.0])
+def test_a_jump_below_the_jitter_is_known_or_in_doubt(step_ms: float):
+    """The clock's standard deviation covers it from the first frame on."""
+    found = [jumps(regular(), stepped(step_ms), 50.0, seed) for seed in range(N_RUNS)]
+    covered = [
+        run != [] and abs(step_ms * 1e6 - run[0].ahead_ns) <= max(run[0].sigma_ns, 1.0) for run in found
+    ]
+    assert sum(covered) >= N_RUNS - MAX_WRONG
+
+
+@pytest.mark.parametrize("jitter_ms", [1.0, 50.0])
+def test_a_pause_of_the_camera_is_no_jump(jitter_ms: float):
+    """Where lags vary less than the pause they rule a jump out; else the clock is in doubt by less than the pause."""
+    captured = [t + 25_000_000 * (k >= HISTORY) for k, t in enumerate(regular())]
+    runs = [jumps(captured, captured, jitter_ms, seed) for seed in range(N_RUNS)]
+    assert sum(any(jump.ahead_ns for jump in run) for run in runs) <= MAX_WRONG
+    assert max(len(run) for run in runs) <= (1 if jitter_ms > 25 else 0)
+    assert all(jump.sigma_ns <= PERIOD_NS for run in runs for jump in run)
+
+
+@pytest.mark.parametrize("jitter_ms", [1.0, 10.0])
+def test_missing_and_swapped_frames_are_no_jump(jitter_ms: float):
+    found = []
+    for seed in range(N_RUNS):
+        present = np.random.default_rng(seed).random(HISTORY + SINCE) > 0.3
+        captured = [t for t, is_present in zip(regular(), present, strict=True) if is_present]
+        found += jumps(captured, captured, jitter_ms, seed)
+    assert found == []
+
+
+@pytest.mark.parametrize("jitter_ms", [1.0, 10.0])
+def test_another_rate_of_the_camera_is_no_jump(jitter_ms: float):
+    """Of an exposure that is set longer or shorter, and of one that varies all the time."""
+    n = np.arange(HISTORY + SINCE)
+    for factor in (
+        1.3 * (n >= HISTORY) + (n < HISTORY),
+        0.5 * (n >= HISTORY) + (n < HISTORY),
+        1 + 0.5 * np.sin(n),
+    ):
+        captured = np.cumsum(PERIOD_NS * factor).astype(int).tolist()
+        runs = [jumps(captured, captured, jitter_ms, seed) for seed in range(N_RUNS)]
+        assert not any(jump.ahead_ns for run in runs for jump in run)
+
+
+def test_a_late_frame_is_no_jump():
+    """A slow network leaves the intervals between the stamps as they are."""
+    check = StampCheck()
+    lags_ms = [10 + k % 3 for k in range(HISTORY)] + [50, 30, 11]
+    assert not any(
+        check.add(t, t + round(1e6 * lag)) for t, lag in zip(regular(len(lags_ms)), lags_ms, strict=True)
+    )
