@@ -42,7 +42,8 @@ class _Clock:
     Attributes:
         check: of its stamps.
         correction_s, sigma_s: added to its stamps at `since_ns`, and the standard deviation.
-        rate, since_ns: by which that grows, and a time of the camera's.
+        rate, rate_sigma: by which that grows, and the standard deviation.
+        since_ns, now_ns: the time of the last estimate, and of the last frame.
         reported_s: the correction that was last reported.
     """
 
@@ -50,7 +51,9 @@ class _Clock:
     correction_s: float = 0.0
     sigma_s: float = 0.0
     rate: float = 0.0
+    rate_sigma: float = 0.0
     since_ns: int = 0
+    now_ns: int = 0
     reported_s: float = 0.0
 
     def at(self, t_ns: int) -> float:
@@ -58,10 +61,16 @@ class _Clock:
         return self.correction_s + self.rate * (t_ns - self.since_ns) * 1e-9
 
     @property
+    def known_s(self) -> float:
+        """Standard deviation of the correction of the last frame: the rate is not known exactly."""
+        return math.hypot(self.sigma_s, self.rate_sigma * (self.now_ns - self.since_ns) * 1e-9)
+
+    @property
     def health(self) -> ClockHealth:
-        known_s = max(REPORTED_S, abs(self.correction_s))
-        state = "uncertain" if self.sigma_s > known_s else "corrected" if known_s > REPORTED_S else "correct"
-        return ClockHealth(state, 1e3 * self.correction_s, 1e3 * self.sigma_s)
+        offset_s, sigma_s = self.at(self.now_ns), self.known_s
+        size_s = max(REPORTED_S, abs(offset_s))
+        state = "uncertain" if sigma_s > size_s else "corrected" if size_s > REPORTED_S else "correct"
+        return ClockHealth(state, 1e3 * offset_s, 1e3 * sigma_s)
 
 
 class CameraClocks:
@@ -80,7 +89,7 @@ class CameraClocks:
 
     def uncertain(self, speed_m_s: float) -> set[str]:
         """Cameras whose time is not known well enough to locate robots at this speed, while two others are."""
-        found = {name for name, clock in self._clocks.items() if clock.sigma_s * speed_m_s > MAX_MOTION_M}
+        found = {name for name, clock in self._clocks.items() if clock.known_s * speed_m_s > MAX_MOTION_M}
         return found if len(self._clocks) > len(found) + 1 else set()
 
     def inherit(self, old: "CameraClocks") -> None:
@@ -95,6 +104,7 @@ class CameraClocks:
         """Take the stamp and the arrival of the next frame of a camera; the standard deviation of its clock, s, if its
         stamps jumped, or may have, else 0."""
         name, clock = frame.camera, self._clocks[frame.camera]
+        clock.now_ns = frame.t_ns
         jump = clock.check.add(frame.t_ns, frame.received_ns)
         if jump is None:
             return 0.0
@@ -110,21 +120,22 @@ class CameraClocks:
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None if that time is in the future."""
-        clock = self._clocks[frame.camera]
+        name, clock = frame.camera, self._clocks[frame.camera]
         if clock.since_ns or clock.sigma_s:
-            sigma_s = math.hypot(frame.clock_sigma_s, clock.sigma_s)
-            t_ns = frame.t_ns + round(1e9 * clock.at(frame.t_ns))
-            frame = replace(frame, t_ns=t_ns, clock_sigma_s=sigma_s)
+            correction_s, sigma_s = clock.at(frame.t_ns), math.hypot(frame.clock_sigma_s, clock.known_s)
+            if abs(correction_s - clock.reported_s) > REPORTED_S + abs(clock.reported_s):
+                clock.reported_s = correction_s
+                log.warning(
+                    "camera %s: its clock drifts from the others by %.0f ppm; its stamps are corrected, now by %.1f ms",
+                    *(name, -1e6 * clock.rate, 1e3 * correction_s),
+                    extra=about(name),
+                )
+            frame = replace(frame, t_ns=frame.t_ns + round(1e9 * correction_s), clock_sigma_s=sigma_s)
         return None if frame.t_ns > frame.received_ns + MAX_AHEAD_NS else frame
 
-    def correct(self, departure: Departure, now_ns: int) -> None:
+    def correct(self, departure: Departure) -> None:
         """Correct the clock of a camera that departs from the others."""
-        name = self._names[departure.camera]
-        clock, t_ns = self._clocks[name], departure.t_ns
+        clock, t_ns = self._clocks[self._names[departure.camera]], departure.t_ns
         clock.correction_s, clock.since_ns = clock.at(t_ns) + departure.offset_s, t_ns
         clock.rate, clock.sigma_s = clock.rate + departure.rate, departure.sigma_s
-        if abs(clock.correction_s - clock.reported_s) < REPORTED_S + abs(clock.reported_s):
-            return
-        clock.reported_s = clock.correction_s
-        message = "camera %s: its clock drifts from the others by %.0f ppm; its stamps are corrected, now by %.1f ms"
-        log.warning(message, name, -1e6 * clock.rate, 1e3 * clock.at(now_ns), extra=about(name))
+        clock.rate_sigma = departure.rate_sigma

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.foundation.arrays import Array
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
@@ -23,15 +22,14 @@ class CameraMonitors:
     Args:
         cameras: cameras of the rig; `check` and `place` change their poses.
         markers: of all robots.
-        densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
     """
 
-    def __init__(self, cameras: CameraArray, markers: MarkerTable, densities: Array) -> None:
+    def __init__(self, cameras: CameraArray, markers: MarkerTable) -> None:
         self._cameras, self._speed_m_s = cameras, 0.0
         self.clocks = CameraClocks(cameras.names)
         self.frozen = FrozenImages(cameras, markers)
         self.consistency = FrameConsistency(cameras, markers)
-        self.rig = RigMonitor(cameras, markers, densities)
+        self.rig = RigMonitor(cameras, markers)
 
     @property
     def withheld(self) -> set[str]:
@@ -70,8 +68,8 @@ class CameraMonitors:
     ) -> tuple[ExtrinsicsCorrection, ...]:
         """Exclude moved cameras, apply recalibrated poses and correct clocks; see `RigMonitor.check`."""
         corrections = self.rig.check(frame_set, now, recalibrates, is_doubtful)
-        if (departure := self.rig.take_departure()) is not None:
-            self.clocks.correct(departure, now.t_ns)
+        for departure in self.rig.take_departures():
+            self.clocks.correct(departure)
         for correction in corrections:
             if correction.camera is not None:
                 self._cameras.place(correction.name, correction.camera)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The clocks of the cameras as random walks: offsets and rates, from windows of keyframes (a Kalman filter).
+"""The clocks of the cameras as random walks: offsets and rates, from the keyframes of the rig graph (a Kalman filter).
 
-A window shows the differences between the offsets; a common one of all cameras moves robots along their paths. So the
-camera at fault is the one that alone explains the estimate, by a margin over every other one: a generalized likelihood
-ratio, as in `hypotheses`. docs/design/time_offsets.md has the equations.
+The errors of the cameras' poses and lenses are states of the same filter, so that they do not look like offsets. A
+common offset of all cameras moves robots along their paths. So the camera at fault is the one that alone explains the
+estimate, by a margin over every other one: a generalized likelihood ratio, as in `hypotheses`.
+docs/design/time_offsets.md has the equations.
 """
 
 from dataclasses import dataclass
@@ -11,28 +12,27 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
+from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array
-from fusion.rig_graph.hypotheses import FALSE_ALARM
+from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA
 
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock
 RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crystals have 1e-4, bad drivers more
-RATE_WALK = 1e-5  # change of a rate in a second, which a clock that begins to drift needs
-BIAS_SIGMA_S = (
-    2e-3  # of what windows show of an offset, the same in all: errors of velocities, lenses and shapes
-)
-MAX_OFFSET_S = 1.0  # standard deviation beyond which nothing is known
+RATE_WALK = 1e-4  # change of a rate in a second: a daemon that slews a clock changes it by 5e-4 at once
+MEMORY_S = 10.0  # of errors of poses and lenses: what they do to offsets varies with the places of robots
 RIVAL = 1e-3  # likelihood of another camera at fault, relative to the accepted one
 
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """A camera whose true capture times are later than its stamps by offset_s + rate (t - t_ns), sigma_s at t_ns."""
+    """A camera whose true capture times are later than its stamps by offset_s + rate (t - t_ns), with their sigmas."""
 
     camera: int
     t_ns: int
     offset_s: float
     rate: float
     sigma_s: float
+    rate_sigma: float
 
     def at(self, t_ns: int) -> float:
         """The offset at a time, s."""
@@ -46,59 +46,82 @@ class ClockWalk:
         n_cameras: C.
 
     Attributes:
-        x, P: (3 C,) offset (s) and rate of each camera, then the bias of each offset, and their covariance.
+        x, P: (9 C,) the errors of the cameras, 8 of each, and then the rates of their clocks; and their covariance.
+        offsets, rates: (C,) rows of these.
+        departed: cameras whose clocks jumped or drifted, oldest first: they are not held to be right any more.
     """
 
     def __init__(self, n_cameras: int) -> None:
-        self._n, self._t_ns = n_cameras, 0
-        self.x, self.P = np.zeros(0), np.zeros((0, 0))
-        self._restart()
+        self._n, self._t_ns, self.departed = n_cameras, 0, list[int]()
+        self.rates = ERRORS * n_cameras + np.arange(n_cameras)
+        self.offsets = ERRORS * np.arange(n_cameras) + CAUSES["clock"].start
+        self.x = np.zeros((ERRORS + 1) * n_cameras)
+        self._most = np.concatenate([np.tile(FREE_SIGMA, n_cameras), np.full(n_cameras, RATE_SIGMA)])
+        self.P = np.diag(self._most**2)
+        self.P[self.offsets, self.offsets] = OFFSET_SIGMA_S**2
 
-    def _restart(self) -> None:
-        n, self.x = self._n, np.zeros(3 * self._n)
-        self.P = np.diag([*np.tile([OFFSET_SIGMA_S**2, RATE_SIGMA**2], n), *np.full(n, BIAS_SIGMA_S**2)])
+    def forget_poses(self) -> None:
+        """The poses of the cameras are others."""
+        others = np.setdiff1d(np.arange(ERRORS * self._n), self.offsets)
+        self.x[others], self.P[others], self.P[:, others] = 0.0, 0.0, 0.0
+        self.P[others, others] = self._most[others] ** 2
 
     def jump(self, camera: int, sigma_s: float) -> None:
         """The stamps of a camera were corrected by a jump with this standard deviation, or may have jumped so far."""
-        self.P[2 * camera, 2 * camera] += sigma_s**2
+        self.P[self.offsets[camera], self.offsets[camera]] += sigma_s**2
+        self._depart(camera)
 
-    def update(self, t_ns: int, M: Array, y: Array) -> None:
-        """Add a window: least squares M x = y (C, C) and (C,) about the offsets at its middle."""
+    def _depart(self, camera: int) -> None:
+        """At least one clock is held to be right: the windows show differences."""
+        others = [k for k in self.departed if k != camera]
+        self.departed = [*others, camera][max(0, len(others) + 2 - self._n) :]
+
+    def update(self, t_ns: int, H: Array, y: Array) -> None:
+        """Add keyframes: least squares H e = y, (8 C, 8 C) and (8 C,), about the cameras' errors at their mean time."""
         self._predict(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
-        self._t_ns = t_ns
-        information = np.linalg.inv(self.P)
-        right = information @ self.x
-        shown = np.zeros((self._n, 3 * self._n))
-        shown[:, : 2 * self._n : 2] = shown[:, 2 * self._n :] = np.eye(self._n)
-        information += shown.T @ M @ shown
-        right += shown.T @ y
-        self.P = np.linalg.inv(information)
-        self.x = self.P @ right
+        self._t_ns, seen = t_ns, slice(0, len(y))
+        P = np.linalg.solve(np.eye(len(self.P)) + self.P[:, seen] @ np.pad(H, ((0, 0), (0, self._n))), self.P)
+        self.P = (P + P.T) / 2
+        self.x = self.x + self.P[:, seen] @ (y - H @ self.x[seen])
 
     def _predict(self, dt: float) -> None:
-        F, noise = np.eye(3 * self._n), np.zeros((3 * self._n, 3 * self._n))
-        F[: 2 * self._n, : 2 * self._n] = np.kron(np.eye(self._n), [[1.0, dt], [0.0, 1.0]])
-        Q = RATE_WALK**2 * dt * np.array([[dt**2 / 3, dt / 2], [dt / 2, 1.0]])
-        noise[: 2 * self._n, : 2 * self._n] = np.kron(np.eye(self._n), Q)
-        self.x, self.P = F @ self.x, F @ self.P @ F.T + noise
-        if np.diag(self.P).max() > MAX_OFFSET_S**2:
-            self._restart()
+        F, Q = np.eye(len(self.x)), np.zeros_like(self.P)
+        F[self.offsets, self.rates] = dt
+        walk = RATE_WALK**2 * dt
+        Q[self.offsets, self.offsets], Q[self.rates, self.rates] = walk * dt**2 / 3, walk
+        Q[self.offsets, self.rates] = Q[self.rates, self.offsets] = walk * dt / 2
+        grown = np.full(len(self.x), np.sqrt(1 + dt / MEMORY_S))
+        grown[self.offsets], grown[self.rates] = 1.0, 1.0
+        self.x, P = F @ self.x, F @ (self.P * np.outer(grown, grown)) @ F.T + Q
+        bounded = np.minimum(1.0, self._most / np.sqrt(np.diag(P)))
+        self.P = P * np.outer(bounded, bounded)
 
-    def take_departure(self) -> Departure | None:
-        """The camera at fault, whose stamps are corrected from now on; None if none is, or the windows do not decide.
+    def take_departures(self) -> tuple[Departure, ...]:
+        """What the stamps of departed cameras are corrected by from now on, after a search for another such camera.
 
         Its clock may depart as much again: the prior of a good clock does not hold for it.
         """
-        M = np.linalg.inv(self.P[: 2 * self._n, : 2 * self._n])
-        own = np.arange(2 * self._n).reshape(-1, 2)
-        y, blocks = (M @ self.x[: 2 * self._n])[own], np.linalg.inv(M[own[:, :, None], own[:, None]])
-        alone = np.einsum("kij,kj->ki", blocks, y)
-        explained = np.sum(y * alone, 1)
-        k = int(np.argmax(explained))
-        rival = np.max(np.delete(explained, k), initial=0.0)
-        if explained[k] < chdtri(2, FALSE_ALARM) or explained[k] - rival < chdtri(2, RIVAL):
-            return None
-        self.x[own[k]] -= alone[k]
-        self.P[own[k], own[k]] += alone[k] ** 2
-        offset_s, rate = alone[k].tolist()
-        return Departure(k, self._t_ns, offset_s, rate, float(np.sqrt(blocks[k, 0, 0])))
+        of_clocks, own = np.stack([self.offsets, self.rates], axis=1), np.arange(2 * self._n).reshape(-1, 2)
+        M = np.linalg.inv(self.P[np.ix_(of_clocks.ravel(), of_clocks.ravel())])
+        y = M @ self.x[of_clocks.ravel()]
+
+        def explain(cameras: list[int]) -> tuple[float, Array, Array]:
+            rows = own[cameras].ravel()
+            covariance = np.linalg.inv(M[np.ix_(rows, rows)])
+            alone = covariance @ y[rows]
+            return float(y[rows] @ alone), alone.reshape(-1, 2), np.sqrt(np.diag(covariance)).reshape(-1, 2)
+
+        others = [k for k in range(self._n) if k not in self.departed]
+        known = explain(self.departed)[0]
+        explained = sorted((explain([*self.departed, k])[0] - known, k) for k in others)
+        (best, k), rival = explained[-1], explained[-2][0] if len(others) > 1 else 0.0
+        if len(others) > 1 and best > chdtri(2, FALSE_ALARM) and best - rival > chdtri(2, RIVAL):
+            self._depart(k)
+            clock = of_clocks[k]
+            self.P[clock, clock] += explain(self.departed)[1][-1] ** 2
+        _, alone, sigma = explain(self.departed)
+        self.x[of_clocks[self.departed]] -= alone
+        return tuple(
+            Departure(k, self._t_ns, *a.tolist(), *b.tolist())
+            for k, a, b in zip(self.departed, alone, sigma, strict=True)
+        )

@@ -31,7 +31,6 @@ Cause = Literal["pose", "clock", "focal"]
 # Standard deviations of errors that a hypothesis frees: weak, they only keep the system regular.
 FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [1.0, 0.1])
 POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
-DOUBTED = 10.0  # ratio of errors of a calibration to its claims, that must not look like errors of clocks
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
 MAX_ITERATIONS, CONVERGED = 20, 1e-4  # relative decrease of the cost
 FIRST_DAMPING = 1e-4
@@ -131,6 +130,12 @@ class Fit:
     reduced: Array
     by_camera: Array
     squared: Array
+
+    @property
+    def equations(self) -> tuple[Array, Array]:
+        """Least squares H e = y, (8 C, 8 C) and (8 C,), about the errors by the observations alone."""
+        H, g = self.reduced[:, :-1], self.reduced[:, -1]
+        return H / self.variance, (g + H @ self.errors.ravel()) / self.variance
 
     @property
     def penalty(self) -> float:
@@ -244,23 +249,6 @@ def judge(window: Window, starts: Array) -> Verdict:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
     return replace(decide([none, *fits, everything], n), misfit=none.misfit)
-
-
-def about_clocks(best: Fit, prior: Array) -> tuple[Array, Array]:
-    """Least squares M x = y, (C, C) and (C,), about the clock offsets (s) that a window shows.
-
-    Poses and focal lengths have ten times the errors that the calibration's prior, (8 C, 8 C), states: they would bias
-    the offsets.
-    """
-    H, g, e = best.reduced[:, :-1], best.reduced[:, -1], best.errors.ravel()
-    is_clock = np.arange(len(g)) % ERRORS == CAUSES["clock"].start
-    c, x = np.flatnonzero(is_clock), np.flatnonzero(~is_clock)
-    weak = np.linalg.inv(DOUBTED**2 * prior[np.ix_(x, x)])
-    by_others = np.linalg.solve(
-        H[np.ix_(x, x)] + weak, np.column_stack([H[np.ix_(x, c)], g[x] - weak @ e[x]])
-    )
-    M = H[np.ix_(c, c)] - H[np.ix_(c, x)] @ by_others[:, :-1]
-    return M / best.variance, (M @ e[c] + g[c] - H[np.ix_(c, x)] @ by_others[:, -1]) / best.variance
 
 
 def is_contradicted(none: Fit, n_cameras: int) -> bool:

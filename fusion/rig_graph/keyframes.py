@@ -34,6 +34,9 @@ SEARCH_PX = 120.0  # largest image shift: 8 degrees at a focal length of 840 px
 BIN_PX = 6.0
 INTERVAL_NS = 90_000_000  # between keyframes: a tenth of a second, at 30 frame sets a second too
 HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its robots
+# Variance of a mean velocity over that of its difference from the mean in half the time, by white acceleration: the
+# density times HALF / 6, and times HALF / 24.
+WIDER = 4.0
 MAX_ROBOTS = 4  # of a keyframe; the next one has others
 # Between expected and detected markers: robots that follow a camera at fault are expected pixels away, and discs of
 # other markers are at least their own diameter away.
@@ -70,12 +73,16 @@ class Keyframe:
         views: of all cameras, also of those at fault.
         robots: (K,) rows of the robots.
         states: of these, with mean velocities.
+        noise, change: (K, 2) variances of these, angular and linear: by the errors of the poses, and by accelerations
+            that change around the keyframe (an estimate, which may be negative).
     """
 
     t_ns: int
     views: tuple[FrameView, ...]
     robots: Index
     states: States
+    noise: Array
+    change: Array
 
 
 class Keyframes:
@@ -129,23 +136,22 @@ class Keyframes:
 
     def _keyframe(self, frame_set: FrameSet) -> Keyframe | None:
         """The robots of a frame set with mean velocities around it, which stamps of one frame do not change."""
-        t_ns = frame_set.t_ns
-        first, now, last = (
+        t_ns, half = frame_set.t_ns, HALF_NS // 2
+        first, early, now, late, last = (
             min(self._history, key=lambda s: abs(s.t_ns - at))
-            for at in (t_ns - HALF_NS, t_ns, t_ns + HALF_NS)
+            for at in (t_ns - HALF_NS, t_ns - half, t_ns, t_ns + half, t_ns + HALF_NS)
         )
-        seconds = (last.t_ns - first.t_ns) * 1e-9
-        known = np.flatnonzero(first.tracked & now.tracked & last.tracked)
-        if now.t_ns != t_ns or seconds < 1e-9 * HALF_NS or not len(known):
+        known = np.flatnonzero(np.all([s.tracked for s in (first, early, now, late, last)], axis=0))
+        if now.t_ns != t_ns or late.t_ns - early.t_ns < half or not len(known):
             return None
         self._turn += MAX_ROBOTS
         robots = np.sort(np.roll(known, -self._turn % len(known))[:MAX_ROBOTS])
-        states = now.states.select(robots)
-        turned = last.states.R[robots] @ first.states.R[robots].transpose(0, 2, 1)
-        moved = last.states.p[robots] - first.states.p[robots]
-        states = replace(states, v=moved / seconds, omega=vector_from_rotation(turned) / seconds)
+        mean, noise = _mean_motion(first, last, robots)
+        inner, more = _mean_motion(early, late, robots)
+        states = replace(now.states.select(robots), omega=mean[0], v=mean[1])
+        change = np.mean((inner - mean) ** 2, axis=2).T - noise - more
         views = tuple(self._view(frame, t_ns, now.states, robots) for frame in frame_set.frames)
-        return Keyframe(t_ns, views, robots, states)
+        return Keyframe(t_ns, views, robots, states, noise, WIDER * change)
 
     def _view(self, frame: CalibratedFrame, t_ns: int, states: States, robots: Index) -> FrameView:
         markers, tau = self._markers, (frame.t_ns - t_ns) * 1e-9
@@ -154,11 +160,16 @@ class Keyframes:
         return FrameView(frame, seen.rows, seen.points, seen.uv)
 
 
+def _mean_motion(first: Snapshot, last: Snapshot, robots: Index) -> tuple[Array, Array]:
+    """(2, K, 3) mean angular and linear velocities of robots between two times, and (K, 2) their variances."""
+    a, b, seconds = first.states.select(robots), last.states.select(robots), (last.t_ns - first.t_ns) * 1e-9
+    moved = np.stack([vector_from_rotation(b.R @ a.R.transpose(0, 2, 1)), b.p - a.p])
+    variance = np.diagonal(a.P + b.P, axis1=1, axis2=2)[:, :6].reshape(-1, 2, 3).mean(2)
+    return moved / seconds, variance / seconds**2
+
+
 def window_of(
-    keyframes: Sequence[Keyframe],
-    cameras: CameraArray,
-    markers: MarkerTable,
-    densities: Array,
+    keyframes: Sequence[Keyframe], cameras: CameraArray, markers: MarkerTable
 ) -> tuple[Window, Array]:
     """The problem of some keyframes, and for each camera the errors (C, 8) that explain its images alone.
 
@@ -166,7 +177,6 @@ def window_of(
         keyframes: at least one.
         cameras: C cameras of the rig.
         markers: of all robots.
-        densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
     """
     starts = np.zeros((len(cameras.names), ERRORS))
     found: list[list[tuple[CalibratedFrame, Index, Index]]] = [[] for _ in keyframes]
@@ -177,7 +187,7 @@ def window_of(
         starts[k, :3], starts[k, 3:6] = vector_from_rotation(inverse[None, :3, :3])[0], inverse[:3, 3]
         for (number, view), (rows, detections) in zip(views, matches, strict=True):
             found[number].append((view.frame, view.rows[rows], detections))
-    return _assemble(keyframes, found, cameras, markers, densities), starts
+    return _assemble(keyframes, found, cameras, markers), starts
 
 
 def _views(keyframes: Sequence[Keyframe], name: str) -> list[tuple[int, FrameView]]:
@@ -268,7 +278,6 @@ def _assemble(
     found: Sequence[Sequence[tuple[CalibratedFrame, Index, Index]]],
     cameras: CameraArray,
     markers: MarkerTable,
-    densities: Array,
 ) -> Window:
     """The problem of matched detections: of each keyframe its frames, with rows of markers and of detections."""
     tables, discs, n_frames, n_bodies = [], [], 0, 0
@@ -303,14 +312,20 @@ def _assemble(
         T=np.array([cameras[name].matrix() for name in cameras.names]),
         prior=_prior(cameras, exposures),
         states=states,
-        velocity_sigma=np.sqrt(
-            densities[robots] * (1e-9 * HALF_NS / 6)
-        ),  # of a velocity, beside its mean around it
+        velocity_sigma=velocity_sigma(keyframes, robots),
         single=single,
         observations=observations,
         by_focal=np.ascontiguousarray(by_focal[:, :, 0].T),
         keyframe=np.repeat(np.arange(len(keyframes)), [len(keyframe.robots) for keyframe in keyframes]),
     )
+
+
+def velocity_sigma(keyframes: Sequence[Keyframe], robots: Index) -> Array:
+    """(B, 2) standard deviations of velocities: `change` is that of the keyframe, at least its robot's mean."""
+    noise, change = (np.concatenate([getattr(k, name) for k in keyframes]) for name in ("noise", "change"))
+    count = np.maximum(np.bincount(robots), 1)
+    usual = np.stack([np.bincount(robots, of) / count for of in change.T], axis=1)[robots]
+    return np.sqrt(noise + np.maximum(0.0, np.maximum(change, usual)))
 
 
 def _are_determined(robot: Index, camera: Index) -> Mask:

@@ -42,7 +42,6 @@ from fusion.rig_graph.hypotheses import (
     Hypothesis,
     Verdict,
     Window,
-    about_clocks,
     fit,
     judge,
     retract,
@@ -51,6 +50,8 @@ from fusion.rig_graph.keyframes import Keyframe, Keyframes, window_of
 
 log = logging.getLogger("fusion")
 T = TypeVar("T")
+Measured = tuple[int, Array, Array]  # Unix time in ns, and H (8 C, 8 C) and y (8 C,) of `ClockWalk.update`
+Judgement = tuple[Window, Verdict, Measured | None]
 NICENESS = 10  # of the process that judges: poses and detections come first
 # Keyframes that are judged: the more, the better they determine a camera; the fewer, the sooner all of them are new.
 WINDOWS = 24, 12, 6
@@ -75,7 +76,6 @@ class RigMonitor:
     Args:
         cameras: cameras of the rig.
         markers: of all robots.
-        densities: (R, 2) of white angular and linear acceleration, rad^2/s^3 and m^2/s^3.
 
     Attributes:
         excluded: names of moved cameras whose poses are not known yet.
@@ -85,18 +85,16 @@ class RigMonitor:
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
     """
 
-    def __init__(self, cameras: CameraArray, markers: MarkerTable, densities: Array) -> None:
+    def __init__(self, cameras: CameraArray, markers: MarkerTable) -> None:
         self._cameras, self._markers = cameras, markers
-        self._densities = densities
         self._keyframes = Keyframes(cameras, markers, max(WINDOWS))
-        self._job: Future[tuple[Window, Verdict] | None] | None = None
+        self._job: Future[Judgement | None] | None = None
         self._checked_ns = self._revision = self._n_undecided = 0
         self._pause_ns = 0  # after the last job
         self._is_contradicted = False
         self._walk = ClockWalk(len(cameras.names))
-        self._departure: Departure | None = None
-        self._given: tuple[Keyframe, ...] = ()  # to the last job
-        self._measured_ns = 0  # of the last keyframe that the walk contains
+        self._departures: tuple[Departure, ...] = ()
+        self._given_ns = self._measured_ns = 0  # of the last keyframes of the last job, and of the walk
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._was_doubtful = False
         self.widening, self._claim_m = 1.0, 0.0  # a detection's claimed error at its robot, metres
@@ -149,12 +147,11 @@ class RigMonitor:
             ),
         )
 
-    def take_departure(self) -> Departure | None:
-        """The clock that departs from the others, which is corrected from now on."""
-        found, self._departure = self._departure, None
-        if found is not None:
-            self._keyframes.retime(self._cameras.names[found.camera], found.at)
-            self._job = None
+    def take_departures(self) -> tuple[Departure, ...]:
+        """The clocks that depart from the others, which are corrected from now on."""
+        found, self._departures = self._departures, ()
+        for departure in found:
+            self._keyframes.retime(self._cameras.names[departure.camera], departure.at)
         return found
 
     def jump(self, name: str, sigma_s: float) -> None:
@@ -188,8 +185,8 @@ class RigMonitor:
             self._checked_ns = now.t_ns
             self._revision = self._cameras.revision
             given = self._cameras.as_dict()  # of this moment
-            self._given = tuple(kept)
-            job = partial(judge_latest, self._given, given, self._markers, self._densities)
+            self._given_ns = kept[-1].t_ns
+            job = partial(judge_latest, tuple(kept), given, self._markers, self._measured_ns)
             self._job = _done(job) if self.executor is None else self.executor.submit(job)
         if self._job is None or not self._job.done():
             return ()
@@ -207,9 +204,11 @@ class RigMonitor:
             return ()
         return self._act(*judged, recalibrates)
 
-    def _act(self, window: Window, verdict: Verdict, recalibrates: bool) -> tuple[ExtrinsicsCorrection, ...]:
+    def _act(
+        self, window: Window, verdict: Verdict, measured: Measured | None, recalibrates: bool
+    ) -> tuple[ExtrinsicsCorrection, ...]:
         names = tuple(window.names[k] for k in verdict.cameras)
-        self._note_clocks(window, verdict)
+        self._note_clocks(verdict, measured)
         self._is_contradicted = bool(names)
         self.widening = verdict.misfit if names else 1.0
         self._claim_m = _claim_m(window)
@@ -236,7 +235,7 @@ class RigMonitor:
             self._use(name)
         return tuple(ExtrinsicsCorrection(name, self._cameras[name], has_returned=True) for name in names)
 
-    def _note_clocks(self, window: Window, verdict: Verdict) -> None:
+    def _note_clocks(self, verdict: Verdict, measured: Measured | None) -> None:
         """Add a window that contradicts no pose and no lens to what is known of the clocks.
 
         A jump of a clock is believed once several verdicts in a row agree on it: a robot's own motion may look like
@@ -245,15 +244,16 @@ class RigMonitor:
         self._clocks = [*self._clocks, *verdict.cameras] if verdict.cause == "clock" else []
         if len(set(self._clocks)) > 1:
             self._clocks = self._clocks[-1:]
-        times = [keyframe.t_ns for keyframe in self._given[-1 - int(window.keyframe.max()) :]]
-        if verdict.cause == "clock" and len(self._clocks) >= CONFIRMED:
-            k = verdict.cameras[0]
+        k = verdict.cameras[0] if verdict.cause == "clock" else -1
+        if k >= 0 and len(self._clocks) >= CONFIRMED:
             self._walk.jump(k, abs(float(verdict.fit.errors[k, CAUSES["clock"]][0])))
-        elif verdict.cameras or self.excluded or times[0] <= self._measured_ns:
+        elif verdict.cameras or self.excluded:
             return
-        self._measured_ns = times[-1]
-        self._walk.update(sum(times) // len(times), *about_clocks(verdict.fit, window.prior))
-        self._departure = self._walk.take_departure()
+        if measured is None:
+            return
+        self._measured_ns = self._given_ns
+        self._walk.update(*measured)
+        self._departures = self._walk.take_departures()
 
     def _note_undecided(self, names: tuple[str, ...]) -> None:
         """Log cameras that contradict each other when that begins, and when it ends."""
@@ -308,14 +308,15 @@ class RigMonitor:
     def _use(self, name: str) -> None:
         self.excluded.discard(name)
         self._forget()
+        self._walk.forget_poses()
         self._is_contradicted, self._n_undecided, self.widening = False, 0, 1.0
         self._clocks.clear()
         self._note_undecided(())
 
 
-def _done(job: Callable[[], tuple[Window, Verdict] | None]) -> "Future[tuple[Window, Verdict] | None]":
+def _done(job: Callable[[], Judgement | None]) -> "Future[Judgement | None]":
     """The result of a job that runs at once."""
-    future: Future[tuple[Window, Verdict] | None] = Future()
+    future: Future[Judgement | None] = Future()
     try:
         future.set_result(job())
     except Exception as error:  # as of a job elsewhere
@@ -324,20 +325,28 @@ def _done(job: Callable[[], tuple[Window, Verdict] | None]) -> "Future[tuple[Win
 
 
 def judge_latest(
-    keyframes: Sequence[Keyframe],
-    cameras: Mapping[str, Camera],
-    markers: MarkerTable,
-    densities: Array,
-) -> tuple[Window, Verdict] | None:
-    """Judge the longest window in which nothing changed; None without one."""
+    keyframes: Sequence[Keyframe], cameras: Mapping[str, Camera], markers: MarkerTable, since_ns: int
+) -> Judgement | None:
+    """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
+    cameras' errors is measured."""
     array = CameraArray(dict(cameras))
     for n in WINDOWS:
         if n <= len(keyframes):
-            window, starts = window_of(keyframes[-n:], array, markers, densities)
+            window, starts = window_of(keyframes[-n:], array, markers)
             verdict = judge(window, starts)
             if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
-                return window, verdict
+                return window, verdict, _measure(window, verdict, keyframes[-n:], since_ns)
     return None
+
+
+def _measure(
+    window: Window, verdict: Verdict, keyframes: Sequence[Keyframe], since_ns: int
+) -> Measured | None:
+    times = np.array([keyframe.t_ns for keyframe in keyframes])
+    is_new = times > since_ns
+    if not is_new.any():
+        return None
+    return int(times[is_new].mean()), *fit(window.select(is_new), verdict.fit.hypothesis).equations
 
 
 def _is_stationary(cost: Array) -> bool:

@@ -98,7 +98,7 @@ class Tracker:
         self.acquisition = Acquisition(self.cameras, self.estimator)
         self.unlabeled = UnlabeledTracker(self.cameras, self.table.markers.radius)
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
-        self.monitors = CameraMonitors(self.cameras, self.table.markers, densities)
+        self.monitors = CameraMonitors(self.cameras, self.table.markers)
         self.claims = ClaimCheck(self.estimator, self.table.markers, self.table.names)
         self.geometry = GeometryCheck(self.table.names, self.table.single)
         diameters = np.array([robot.diameter_m for robot in robots.values()])

@@ -155,6 +155,13 @@ def clocks(ms: float, share: float) -> Kind:
     return make
 
 
+def drifting_clock(ppm: float) -> Kind:
+    def make(load: Load, rng: np.random.Generator) -> Setting:
+        return setting(load, {str(rng.choice(list(load.rig))): CameraFault(drift_ppm=ppm)})
+
+    return make
+
+
 def wand(percent: float) -> Kind:
     """The arena's calibration is by a wand that is this much shorter than stated: the rig is larger than the truth."""
 
@@ -204,7 +211,9 @@ KINDS: dict[str, Kind] = {
     "focal +0.2 %": focal(0.2),
     "focal +0.7 %": focal(0.7),
     "focal of all +0.5 %": focal(0.5, all_cameras=True),
-    "clock +25 ms": clocks(25.0, 0.0),
+    **{f"clock +{ms:g} ms": clocks(ms, 0.0) for ms in (10.0, 25.0, 40.0, 1000.0)},
+    **{f"clock {ppm:g} ppm": drifting_clock(ppm) for ppm in (50.0, 2000.0)},
+    "clocks of 1/2 +40 ms": clocks(40.0, 0.5),
     "clocks of 3/4 +40 ms": clocks(40.0, 0.75),
     "wand 1 % short": wand(1.0),
     "marker 10 mm off": marker(10.0),

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from fusion.model.frames import MAX_CLOCK_ERROR_S, clock_sigma_s
-from tests.benchmarks.fusion_load import Load
+from fusion.monitoring.camera_clocks import CameraClocks
+from fusion.rig_graph.clock_walk import Departure
+from tests.benchmarks.fusion_load import START_NS, Load
 from tests.fusion.clock_faults import GRACE_S, Outcome, drift, fuse, inaccurate, step
 
 LOAD = Load(robots=3, cameras=4, hz=30.0, speed_m_s=1.0, crossing=True)
@@ -75,13 +77,13 @@ def test_a_clock_that_drifts_is_reported_before_it_harms():
 @pytest.mark.parametrize(
     ("ppm", "reported_s", "duration_s"),
     [
-        (200.0, 12.0, 16.0),
-        pytest.param(-200.0, 12.0, 16.0, marks=pytest.mark.slow),
-        pytest.param(50.0, 30.0, 36.0, marks=pytest.mark.slow),
+        (200.0, 6.0, 9.0),
+        pytest.param(-200.0, 6.0, 16.0, marks=pytest.mark.slow),
+        pytest.param(50.0, 18.0, 36.0, marks=pytest.mark.slow),
     ],
 )
 def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, duration_s: float):
-    """Before: 200 ppm after 23 to 30 s, 50 ppm never. Windows of 2 s show the offset with a sigma of about 0.1 ms."""
+    """An offset of 0.5 to 0.8 ms is significant (docs/design/time_offsets.md), and so two judgements later reported."""
     faulty = {"cam1": drift(FAULT_S, ppm)}
     outcome = fuse(replace(LOAD, robots=4), duration_s, faulty)
     require_harmless(outcome, faulty)
@@ -90,6 +92,21 @@ def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, du
     corrected_ms = float(line.split("now by ")[1].split()[0])
     assert corrected_ms == pytest.approx(-ppm * 1e-3 * (at_s - FAULT_S), abs=0.6)
     assert outcome.worst_m(FAULT_S) < 0.007  # 4.6 mm without a drift
+
+
+def test_a_drift_that_is_not_measured_any_more_becomes_uncertain():
+    """The correction grows by the rate, and its standard deviation by that of the rate."""
+    clocks, rest_s = CameraClocks(("cam0", "cam1", "cam2")), 600
+    clocks.correct(Departure(1, START_NS, -1e-3, -5e-5, 1e-4, 1e-5))
+    (frame,) = (f for f in LOAD.frames(1 / LOAD.hz) if f.camera == "cam1")
+    later = replace(frame, t_ns=START_NS + rest_s * 10**9, received_ns=START_NS + rest_s * 10**9)
+    clocks.observe(later)
+    admitted = clocks.admit(later)
+    assert admitted is not None
+    assert (admitted.t_ns - later.t_ns) * 1e-9 == pytest.approx(-1e-3 - 5e-5 * rest_s, abs=1e-8)
+    assert admitted.clock_sigma_s == pytest.approx(np.hypot(1e-4, 1e-5 * rest_s))
+    assert clocks.uncertain(1.0) == {"cam1"}
+    assert clocks.uncertain(0.5) == set()
 
 
 @pytest.mark.parametrize("speed_m_s", [pytest.param(0.3, marks=pytest.mark.slow), 1.0])

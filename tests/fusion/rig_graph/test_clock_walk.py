@@ -4,11 +4,19 @@
 import numpy as np
 import pytest
 
-from fusion.rig_graph.clock_walk import ClockWalk, Departure
-from fusion.rig_graph.hypotheses import CAUSES, DOUBTED, ERRORS, Fit, Hypothesis, about_clocks
+from fusion.rig_graph.clock_walk import OFFSET_SIGMA_S, ClockWalk, Departure
+from fusion.rig_graph.hypotheses import CAUSES, ERRORS, FREE_SIGMA
 
 WINDOW_S, SIGMA_S = 2.4, 1e-4  # between windows, and of an offset in one
 START_NS = 10**18
+
+
+def about_offsets(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Equations of the cameras' errors by keyframes that show only the differences between the offsets."""
+    n, H = len(offsets), np.zeros((len(offsets) * ERRORS,) * 2)
+    clock = np.arange(n) * ERRORS + CAUSES["clock"].start
+    H[np.ix_(clock, clock)] = (np.eye(n) - 1 / n) / SIGMA_S**2
+    return H, H[:, clock] @ offsets
 
 
 def first_departure(rates: list[float], seed: int, windows: int = 25) -> Departure | None:
@@ -17,13 +25,10 @@ def first_departure(rates: list[float], seed: int, windows: int = 25) -> Departu
     walk = ClockWalk(n)
     for k in range(windows):
         offsets = np.array(rates) * k * WINDOW_S
-        relative = np.eye(n) - 1 / n
-        M = relative / SIGMA_S**2
-        y = relative @ (offsets + SIGMA_S * rng.normal(size=n)) / SIGMA_S**2
-        walk.update(START_NS + round(k * WINDOW_S * 1e9), M, y)
-        found = walk.take_departure()
-        if found is not None:
-            return found
+        shown = offsets + SIGMA_S * rng.normal(size=n)
+        walk.update(START_NS + round(k * WINDOW_S * 1e9), *about_offsets(shown))
+        if found := walk.take_departures():
+            return found[0]
     return None
 
 
@@ -51,29 +56,30 @@ def test_two_clocks_do_not_show_which_one_departs():
 def test_a_jump_that_is_known_to_be_possible_is_of_that_camera():
     walk = ClockWalk(4)
     walk.jump(2, 0.02)
-    offsets, relative = np.array([0.0, 0.0, 0.025, 0.0]), np.eye(4) - 0.25
-    walk.update(10**9, relative / SIGMA_S**2, relative @ offsets / SIGMA_S**2)
-    found = walk.take_departure()
-    assert found is not None
+    walk.update(10**9, *about_offsets(np.array([0.0, 0.0, 0.025, 0.0])))
+    (found,) = walk.take_departures()
     assert found.camera == 2
     assert found.at(10**9) == pytest.approx(0.025, abs=3 * found.sigma_s)
-    assert np.abs(walk.x[::2]).max() < 5e-4
+    assert np.abs(walk.x[walk.offsets]).max() < 5e-4
 
 
-def test_offsets_are_those_of_the_whole_system_with_free_poses():
+def test_the_filter_is_least_squares_of_all_keyframes():
+    """At one time: errors of poses and lenses do not look like offsets, though the keyframes show them together."""
     rng, n = np.random.default_rng(4), 3
-    A = rng.normal(size=(60, n * ERRORS))
-    errors, truth = 0.1 * rng.normal(size=n * ERRORS), rng.normal(size=n * ERRORS)
-    H, g = A.T @ A, A.T @ (A @ (truth - errors))
-    empty = np.zeros((0, 0))
-    hypothesis = Hypothesis.of(None, (), n)
-    reduced = np.column_stack([H, g])
-    best = Fit(hypothesis, 0.0, errors.reshape(n, ERRORS), empty, reduced, empty, np.zeros(60))
-    M, y = about_clocks(best, np.eye(n * ERRORS))
-    is_clock = np.arange(n * ERRORS) % ERRORS == CAUSES["clock"].start
-    weak = np.where(is_clock, 0.0, DOUBTED**-2)
-    whole = errors + np.linalg.solve(H + np.diag(weak), g - weak * errors)
-    np.testing.assert_allclose(np.linalg.solve(M, y), whole[is_clock], rtol=1e-9)
+    walk = ClockWalk(n)
+    prior = np.linalg.inv(walk.P)[: n * ERRORS, : n * ERRORS]
+    scale = np.tile(FREE_SIGMA, n)
+    scale[walk.offsets] = OFFSET_SIGMA_S
+    A = rng.normal(size=(3, 40, n * ERRORS)) / scale
+    truth = scale * rng.normal(size=n * ERRORS)
+    b = A @ truth + 0.01 * rng.normal(size=A.shape[:2])
+    for rows, right in zip(A, b, strict=True):
+        walk.update(10**9, rows.T @ rows, rows.T @ right)
+    H = np.einsum("wki,wkj->ij", A, A) + prior
+    errors = np.linalg.solve(H, np.einsum("wki,wk->i", A, b))
+    np.testing.assert_allclose(walk.x[: n * ERRORS] / scale, errors / scale, atol=1e-9)
     np.testing.assert_allclose(
-        np.linalg.inv(M), np.linalg.inv(H + np.diag(weak))[np.ix_(is_clock, is_clock)], rtol=1e-9
+        walk.P[: n * ERRORS, : n * ERRORS] / np.outer(scale, scale),
+        np.linalg.inv(H) / np.outer(scale, scale),
+        atol=1e-9,
     )
