@@ -10,7 +10,7 @@ namespace {
 
 constexpr double kBrightest = 250;       // of the levels that are certainly not clipped
 constexpr double kMaxLogExponent = 0.9;  // 2.5: steeper ones enlarge what compression leaves
-constexpr int kHalvings = 16;            // of the interval of exponents
+constexpr int kSteps = 6;                // of Newton's method
 // A print that is only assumed or estimated:
 constexpr double kMaxByCurvature = 0.06;  // smaller roundels may be those of another print
 constexpr double kMinAssumed = -0.3;      // more negative curvatures may be those of another print
@@ -24,17 +24,18 @@ constexpr size_t kMaxMeasured = 8;   // roundels of a frame
 constexpr double kMedianSquare = 0.455;  // of a normal variable of variance 1
 
 /// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
-/// mean of both; levels of 255.
+/// mean of both; levels of 255. It is the exponent of the power mean of both that is this level.
 double log_exponent_of(double dark, double bright, double middle) {
     const double d = std::log(std::max(dark, 1.0) / 255), b = std::log(bright / 255),
                  m = std::log((dark + middle * (bright - dark)) / 255);
-    double low = -kMaxLogExponent, high = kMaxLogExponent;
-    for (int k = 0; k < kHalvings; ++k) {
-        const double log_g = (low + high) / 2, g = std::exp(log_g);
-        const bool too_bright = 2 * std::exp(g * m) > std::exp(g * d) + std::exp(g * b);
-        (too_bright ? low : high) = log_g;
+    double log_g = 0;
+    for (int k = 0; k < kSteps; ++k) {
+        const double g = std::exp(log_g), of_dark = std::exp(g * d), of_bright = std::exp(g * b);
+        const double off = m - std::log((of_dark + of_bright) / 2) / g;
+        const double slope = m - off - (d * of_dark + b * of_bright) / (of_dark + of_bright);
+        log_g = std::clamp(log_g - off / slope, -kMaxLogExponent, kMaxLogExponent);
     }
-    return (low + high) / 2;
+    return log_g;
 }
 
 }  // namespace
@@ -61,7 +62,7 @@ ImageView CameraModel::linearize(const ImageView& image) {
 }
 
 CameraPrior CameraModel::prior_at(double x, double y) const {
-    return {prints_, light_.at(x, y), &remainder_, std::sqrt(curvature_)};
+    return {prints_, light_.at(x, y), &remainder_, std::sqrt(curvature_.value())};
 }
 
 void CameraModel::observe(const std::vector<Observation>& roundels, const ImageView& image) {
@@ -74,25 +75,26 @@ void CameraModel::observe(const std::vector<Observation>& roundels, const ImageV
     if (contradicts(roundels)) forget();
     light_.learn(whole, image);
     learn_response(all);
-    bend_.learn(whole, std::max(1.0, correlation_));
+    bend_.learn(whole, std::max(1.0, correlation_.value()));
 }
 
 /// Learns tone curve and processing. Grey levels of a linear image do not compare with those of another one.
 void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
     learn_edge_noise(fits);
     std::vector<ToneEstimate> measured;
+    std::vector<ToneSample> samples;
     const size_t step = (fits.size() + kMaxMeasured - 1) / kMaxMeasured;
     for (size_t k = 0; k < fits.size(); k += step)
         if (const auto estimate = measure(*fits[k])) {
             measured.push_back(estimate->power);
-            tone_.include(estimate->sample);
+            samples.push_back(estimate->sample);
         }
     learn_curvature(fits);
     if (measured.empty()) return;
     const double exponent = exponent_in_use();
     const bool changed = learn_tone(std::move(measured));
     is_new_ = false;
-    learn_remainder();
+    learn_remainder(samples);
     if (!changed) return;
     last_.clear();
     light_.scale(exponent_in_use() / exponent);
@@ -120,11 +122,12 @@ std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFi
 }
 
 /// What the tone curve leaves beside the power, if the power does not describe it.
-void CameraModel::learn_remainder() {
-    tone_.fit();
+void CameraModel::learn_remainder(const std::vector<ToneSample>& samples) {
+    tone_.learn(samples);
     const double exponent = std::exp(log_exponent_);
-    const bool is_power = tone_.left_by(exponent) < kMinLeft;
-    if (is_power == remainder_.any() || sigma_ == 0) knows_curvature_ = false;
+    left_.include(left_by_power(exponent, samples));
+    const bool is_power = left_.value() < square(kMinLeft);
+    if (is_power == remainder_.any() || !sigma_.is_known()) curvature_.forget();
     if (is_power) {
         remainder_ = {};
         return;
@@ -142,9 +145,8 @@ void CameraModel::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
         for (const RoundelFit* fit : fits) values.push_back(fit->*of);
         return median_of(values);
     };
-    const bool first = edge_noise_ == 0;
-    include_frame(edge_noise_, median(&RoundelFit::edge_residual), first);
-    include_frame(correlation_, median(&RoundelFit::correlation), first);
+    edge_noise_.include(median(&RoundelFit::edge_residual));
+    correlation_.include(median(&RoundelFit::correlation));
 }
 
 /// Whether the ratios of the last frame's roundels changed: those of prints do not, so the camera did.
@@ -165,10 +167,16 @@ bool CameraModel::contradicts(const std::vector<Observation>& roundels) {
     return scores.size() >= kMinWitnesses && median_of(scores) > square(kContradiction);
 }
 
+/// Lets the next frame replace what was measured in levels of another linearization.
+void CameraModel::forget_response() {
+    for (FrameMean* mean : {&mean_, &sigma_, &left_, &edge_noise_, &correlation_}) mean->forget();
+}
+
 /// Lets the next frames teach all but the prints from the start.
 void CameraModel::forget() {
-    sigma_ = edge_noise_ = 0;
-    knows_tone_ = knows_curvature_ = false;
+    forget_response();
+    curvature_.forget();
+    knows_tone_ = false;
     tone_ = {};
     remainder_ = {};
     light_ = {};
@@ -178,7 +186,7 @@ void CameraModel::forget() {
 }
 
 void CameraModel::claim(RoundelFit& fit) const {
-    fit.pose_cov = scaled(fit.pose_cov, std::max({1.0, fit.correlation, correlation_}));
+    fit.pose_cov = scaled(fit.pose_cov, std::max({1.0, fit.correlation, correlation_.value()}));
     const double displacement = surprise_ * square(kEdgeShift * fit.blur);
     for (const size_t i : {2, 4})  // Axx and Ayy
         for (const size_t j : {2, 4}) fit.pose_cov[i][j] += displacement;
@@ -216,10 +224,9 @@ void CameraModel::learn_curvature(const std::vector<const RoundelFit*>& fits) {
     surprise_ = 0;
     if (excess.empty()) return;
     const double variance = median_of(excess);
-    surprise_ = std::max({0.0, variance - curvature_, log_exponent_ == 0 ? 0 : least});
+    surprise_ = std::max({0.0, variance - curvature_.value(), log_exponent_ == 0 ? 0 : least});
     if (!knows_tone_) return;
-    include_frame(curvature_, std::max(0.0, variance), !knows_curvature_);
-    knows_curvature_ = true;
+    curvature_.include(std::max(0.0, variance));
 }
 
 /// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames,
@@ -229,16 +236,15 @@ bool CameraModel::learn_tone(std::vector<ToneEstimate> measured) {
     const double sigma = std::min_element(measured.begin(), measured.end(), [](const auto& a, const auto& b) {
                              return a.sigma < b.sigma;
                          })->sigma;
-    const bool first = sigma_ == 0;
-    include_frame(mean_, middle, first);
-    include_frame(sigma_, sigma, first);
-    const double change = std::abs(mean_ - log_exponent_);
-    const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_) : kMinChange;
-    knows_tone_ |= sigma_ <= kMaxSigma;
-    if (sigma_ > kMaxSigma || change < enough) return false;
+    mean_.include(middle);
+    sigma_.include(sigma);
+    const double mean = mean_.value(), change = std::abs(mean - log_exponent_);
+    const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_.value()) : kMinChange;
+    knows_tone_ |= sigma_.value() <= kMaxSigma;
+    if (sigma_.value() > kMaxSigma || change < enough) return false;
     // The next frame measures the rest: this one was not linear.
-    if (change > kMaxLinear) sigma_ = edge_noise_ = 0;
-    set_exponent(std::abs(mean_) < kMinTone / 2 ? 0 : std::clamp(mean_, -kMaxLogExponent, kMaxLogExponent));
+    if (change > kMaxLinear) forget_response();
+    set_exponent(std::abs(mean) < kMinTone / 2 ? 0 : std::clamp(mean, -kMaxLogExponent, kMaxLogExponent));
     return true;
 }
 

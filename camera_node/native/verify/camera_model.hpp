@@ -45,9 +45,9 @@ class CameraModel {
     void take_over(const CameraModel& from);
 
     /// Whether roundels have shown the tone curve and the processing.
-    bool is_known() const { return edge_noise_ > 0; }
+    bool is_known() const { return edge_noise_.is_known(); }
     /// RMS residual at the edges of roundels without occlusion, linear grey levels; 0 if unknown.
-    double edge_noise() const { return edge_noise_; }
+    double edge_noise() const { return is_known() ? edge_noise_.value() : 0; }
     /// 1 for a linear camera, 2.2 for a usual tone curve; nothing before the roundels have determined it.
     std::optional<double> exponent() const;
     /// That of `linearize`; 1 before it is known.
@@ -69,12 +69,13 @@ class CameraModel {
     static double to_power(double level, double exponent) {
         return 255 * std::pow(std::max(level, 0.0) / 255, exponent);
     }
-    void learn_remainder();
+    void learn_remainder(const std::vector<ToneSample>& samples);
     std::optional<ToneMeasurement> measure(const RoundelFit& fit) const;
     void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
     void learn_curvature(const std::vector<const RoundelFit*>& fits);
     bool learn_tone(std::vector<ToneEstimate> measured);
     bool contradicts(const std::vector<Observation>& roundels);
+    void forget_response();
     void forget();
     void learn_response(const std::vector<const RoundelFit*>& fits);
     void set_exponent(double log_exponent);
@@ -86,10 +87,10 @@ class CameraModel {
     ToneCurve tone_;
     ToneRemainder remainder_;
     double log_exponent_ = 0;  // in use
-    double mean_ = 0;          // of the measured ones
-    double sigma_ = 0;         // of the mean; 0 before the first measurement
-    double edge_noise_ = 0, correlation_ = 1;
-    double curvature_ = 0;  // variance
+    FrameMean mean_, sigma_;   // of the measured ones
+    FrameMean left_;           // mean square of the curvatures that a power leaves
+    FrameMean edge_noise_, correlation_{1};
+    FrameMean curvature_;  // variance
     double surprise_ =
         0;  // variance of a curvature that fits do not contain: what the last frame showed beyond the prior
     /// The ratios of the roundels of the last frame.
@@ -99,7 +100,7 @@ class CameraModel {
     };
     std::vector<SeenRatio> last_;
     bool is_new_ = false;  // the last frame contradicted the model
-    bool knows_tone_ = false, knows_curvature_ = false;
+    bool knows_tone_ = false;
     std::array<uint8_t, 256> linear_;
     std::vector<uint8_t> buffer_;
 };

@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstddef>
 #include <functional>
+#include <optional>
 #include <vector>
 
 #include "fit/photometric_fit.hpp"
+#include "numeric/cholesky.hpp"
 
 namespace roundel {
 
@@ -26,9 +29,58 @@ T median_of(std::vector<T>& values, const Key& key = {}) {
     return *middle;
 }
 
-/// Moves a mean over frames towards the value of a new one, or to it if it is the first.
-inline void include_frame(double& mean, double value, bool first) {
-    mean += (first ? 1 : kNewFrame) * (value - mean);
-}
+/// A mean over frames.
+class FrameMean {
+  public:
+    explicit FrameMean(double before_the_first = 0) : value_(before_the_first) {}
+    void include(double value) {
+        value_ += (known_ ? kNewFrame : 1) * (value - value_);
+        known_ = true;
+    }
+    /// Lets the next frame replace the value.
+    void forget() { known_ = false; }
+    bool is_known() const { return known_; }
+    double value() const { return value_; }
+    void scale(double factor) { value_ *= factor; }
+
+  private:
+    double value_;
+    bool known_ = false;
+};
+
+/// The normal equations of a weighted linear regression on N unknowns.
+template <int N>
+struct Regression {
+    using Row = Vector<N>;
+    struct Estimate {
+        Row mean;
+        std::array<Row, N> cov;
+    };
+    std::array<Row, N> information{};  // lower triangle
+    Row right{};
+    void include(const Row& by, double value, double weight) {
+        for (size_t i = 0; i < N; ++i) {
+            for (size_t j = 0; j <= i; ++j) information[i][j] += weight * by[i] * by[j];
+            right[i] += weight * by[i] * value;
+        }
+    }
+    void forget(double share) {
+        for (Row& row : information)
+            for (double& value : row) value *= 1 - share;
+        for (double& value : right) value *= 1 - share;
+    }
+    /// The estimate with priors of this information and mean on the unknowns; none where it is not
+    /// determined.
+    std::optional<Estimate> solve(const Row& prior, const Row& mean = {}) const {
+        Regression all = *this;
+        for (size_t i = 0; i < N; ++i) {
+            all.information[i][i] += prior[i];
+            all.right[i] += prior[i] * mean[i];
+        }
+        const Cholesky<N> factor(all.information);
+        if (!factor.positive()) return std::nullopt;
+        return Estimate{factor.solve(all.right), factor.template inverse_tail<N>()};
+    }
+};
 
 }  // namespace roundel

@@ -5,14 +5,10 @@
 #include <cmath>
 #include <numbers>
 
-#include "numeric/cholesky.hpp"
-#include "verify/learning.hpp"
-
 namespace roundel {
 
 namespace {
 
-constexpr double kFirst = 2e-4;      // per pixel: a tenth across half of a picture
 constexpr double kLeast = 2e-5;      // of a gradient and of its rest
 constexpr double kSlopePrior = 2;    // standard deviation of M over that of the gradient
 constexpr int kSteps = 3;            // of the prior's variances
@@ -39,8 +35,6 @@ double variance_of(const std::vector<const RoundelFit*>& measured, const Squared
 
 }  // namespace
 
-LightFalloff::LightFalloff() : information_{}, right_{}, all_(square(kFirst)), rest_(square(kFirst)) {}
-
 std::pair<LightFalloff::Row, LightFalloff::Row> LightFalloff::rows(double x, double y) const {
     const double u = (x - x_) * per_radius_, v = (y - y_) * per_radius_;
     return {{1, 0, u, v, 0}, {0, 1, 0, u, v}};
@@ -56,11 +50,11 @@ void LightFalloff::set_size(const ImageView& image) {
 }
 
 LightGradient LightFalloff::at(double x, double y) const {
-    if (!knows_) return {0, 0, kFirst};
+    if (!rest_.is_known()) return {0, 0, kFirst};
     const auto [by_x, by_y] = rows(x, y);
-    double variance = 2 * rest_;
+    double variance = 2 * rest_.value();
     for (size_t i = 0; i < kCoefficients; ++i)
-        variance += by_x[i] * dot(cov_[i], by_x) + by_y[i] * dot(cov_[i], by_y);
+        variance += by_x[i] * dot(now_.cov[i], by_x) + by_y[i] * dot(now_.cov[i], by_y);
     const auto [u, v] = expected(x, y);
     return {u, v, std::sqrt(variance / 2)};
 }
@@ -68,15 +62,15 @@ LightGradient LightFalloff::at(double x, double y) const {
 /// The light over that in the middle of the picture: 1 + a x + x M u / 2, x in pixels.
 double LightFalloff::level(double x, double y) const {
     const auto [by_x, by_y] = rows(x, y);
-    const double twice =
-        (x - x_) * (dot(by_x, mean_) + mean_[kAx]) + (y - y_) * (dot(by_y, mean_) + mean_[kAy]);
+    const double twice = (x - x_) * (dot(by_x, now_.mean) + now_.mean[kAx]) +
+                         (y - y_) * (dot(by_y, now_.mean) + now_.mean[kAy]);
     return std::max(kLeastLevel, 1 + twice / 2);
 }
 
 std::pair<double, double> LightFalloff::expected(double x, double y) const {
     const auto [by_x, by_y] = rows(x, y);
     const double level = this->level(x, y);
-    return {dot(by_x, mean_) / level, dot(by_y, mean_) / level};
+    return {dot(by_x, now_.mean) / level, dot(by_y, now_.mean) / level};
 }
 
 void LightFalloff::learn(const std::vector<const RoundelFit*>& fits, const ImageView& image) {
@@ -86,58 +80,49 @@ void LightFalloff::learn(const std::vector<const RoundelFit*>& fits, const Image
     if (measured.empty()) return;
     const double all = variance_of(
         measured, [](const RoundelFit& fit) { return square(fit.shading.x) + square(fit.shading.y); });
-    include_frame(all_, all, !knows_);
-    for (Row& row : information_)
-        for (double& value : row) value *= 1 - kNewFrame;
-    for (double& value : right_) value *= 1 - kNewFrame;
+    all_.include(all);
+    regression_.forget(kNewFrame);
     for (const RoundelFit* fit : measured) include(*fit);
     solve();
     const double rest = variance_of(measured, [this](const RoundelFit& fit) {
         const auto [x, y] = expected(fit.outer.x, fit.outer.y);
         return square(fit.shading.x - x) + square(fit.shading.y - y);
     });
-    include_frame(rest_, rest, !knows_);
-    knows_ = true;
+    rest_.include(rest);
 }
 
 void LightFalloff::scale(double factor) {
-    for (double& value : right_) value *= factor;
-    for (double& value : mean_) value *= factor;
-    all_ *= square(factor);
-    rest_ *= square(factor);
+    for (double& value : regression_.right) value *= factor;
+    for (double& value : now_.mean) value *= factor;
+    all_.scale(square(factor));
+    rest_.scale(square(factor));
 }
 
 /// Adds a measurement to the normal equations.
 void LightFalloff::include(const RoundelFit& fit) {
     const auto [by_x, by_y] = rows(fit.outer.x, fit.outer.y);
-    const double level = this->level(fit.outer.x, fit.outer.y), variance = fit.shading.variance + rest_;
+    const double level = this->level(fit.outer.x, fit.outer.y),
+                 variance = fit.shading.variance + rest_.value();
     double weight = 1 / variance;
-    if (knows_) {
+    if (rest_.is_known()) {
         const auto [x, y] = expected(fit.outer.x, fit.outer.y);
         weight /= 1 + (square(fit.shading.x - x) + square(fit.shading.y - y)) / (square(kOutlier) * variance);
     }
-    const double sx = fit.shading.x * level, sy = fit.shading.y * level;
-    for (size_t i = 0; i < kCoefficients; ++i) {
-        for (size_t j = 0; j <= i; ++j)
-            information_[i][j] += weight * (by_x[i] * by_x[j] + by_y[i] * by_y[j]);
-        right_[i] += weight * (by_x[i] * sx + by_y[i] * sy);
-    }
+    regression_.include(by_x, fit.shading.x * level, weight);
+    regression_.include(by_y, fit.shading.y * level, weight);
 }
 
 /// Solves the normal equations with a prior whose variances follow from the coefficients themselves
 /// (empirical Bayes): a shrunk estimate would be biased alike in all of a corner.
 void LightFalloff::solve() {
     for (int k = 0; k < kSteps; ++k) {
-        const double slope = (square(mean_[kMxx]) + square(mean_[kMxy]) + square(mean_[kMyy])) / 3;
-        const double middle = std::max(all_, (square(mean_[kAx]) + square(mean_[kAy])) / 2);
-        auto information = information_;
-        for (const size_t i : {kAx, kAy}) information[i][i] += 1 / middle;
-        for (const size_t i : {kMxx, kMxy, kMyy})
-            information[i][i] += 1 / (square(kSlopePrior) * std::max(all_, slope));
-        const Cholesky<kCoefficients> factor(information);
-        if (!factor.positive()) return;
-        mean_ = factor.solve(right_);
-        cov_ = factor.inverse_tail<kCoefficients>();
+        const Row& mean = now_.mean;
+        const double slope = (square(mean[kMxx]) + square(mean[kMxy]) + square(mean[kMyy])) / 3;
+        const double middle = 1 / std::max(all_.value(), (square(mean[kAx]) + square(mean[kAy])) / 2);
+        const double slopes = 1 / (square(kSlopePrior) * std::max(all_.value(), slope));
+        const auto estimate = regression_.solve({middle, middle, slopes, slopes, slopes});
+        if (!estimate) return;
+        now_ = *estimate;
     }
 }
 

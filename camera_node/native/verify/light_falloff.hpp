@@ -4,8 +4,8 @@
 #include <utility>
 #include <vector>
 
-#include "fit/photometric_fit.hpp"
 #include "numeric/image.hpp"
+#include "verify/learning.hpp"
 
 namespace roundel {
 
@@ -15,7 +15,6 @@ namespace roundel {
 /// own. The roundels in view teach all of it; in even light it is 0 and as good as certain.
 class LightFalloff {
   public:
-    LightFalloff();
     /// Learns from the fits of a frame without occlusion, in light without shadows and highlights.
     void learn(const std::vector<const RoundelFit*>& fits, const ImageView& image);
     /// Multiplies all gradients: levels to the power of a factor have that many times the relative gradient.
@@ -34,16 +33,16 @@ class LightFalloff {
     void include(const RoundelFit& fit);
     void solve();
 
-    double x_ = 0;                                // middle of the picture
-    double y_ = 0;                                // middle of the picture
-    double per_radius_ = 0;                       // one over half the picture's diagonal
-    std::array<Row, kCoefficients> information_;  // of the measurements, lower triangle,
-    Row right_;                                   // and their right hand side
-    Row mean_{};                                  // of the coefficients
-    std::array<Row, kCoefficients> cov_{};
-    double all_;   // variance of the gradient, for each component
-    double rest_;  // variance of the gradient's rest, for each component
-    bool knows_ = false;
+    static constexpr double kFirst =
+        2e-4;  // standard deviation of a gradient, per pixel: a tenth across half a picture
+
+    double x_ = 0;           // middle of the picture
+    double y_ = 0;           // middle of the picture
+    double per_radius_ = 0;  // one over half the picture's diagonal
+    Regression<kCoefficients> regression_;
+    Regression<kCoefficients>::Estimate now_{};
+    FrameMean all_{kFirst * kFirst};   // variance of the gradient, for each component
+    FrameMean rest_{kFirst * kFirst};  // variance of the gradient's rest, for each component
 };
 
 }  // namespace roundel

@@ -40,59 +40,45 @@ double ratio_by_curvature(const RoundelFit& fit, double print_ratio) {
     return (1 + print_ratio) * fit.blur * kEdgeShift / radius;
 }
 
-double PrintRatios::Kind::print() const {
-    return (information.yy * by_print - information.xy * by_curvature) / information.det();
-}
-
-double PrintRatios::Kind::curvature() const {
-    return (information.xx * by_curvature - information.xy * by_print) / information.det();
+Regression<2>::Estimate PrintRatios::Kind::estimate() const {
+    return regression.solve({0, 1 / square(kCurvaturePrior)}).value();
 }
 
 double PrintRatios::Kind::curvature_with(double print_ratio) const {
-    return (by_curvature - information.xy * print_ratio) / information.yy;
+    const auto& [information, right] = regression;
+    return (right[1] - information[1][0] * print_ratio) / (information[1][1] + 1 / square(kCurvaturePrior));
 }
 
-double PrintRatios::Kind::sigma() const {
-    return std::max(Print::kPaper, std::sqrt(information.yy / information.det()));
+void PrintRatios::Kind::include(double ratio, double by_curvature, double sigma) {
+    regression.include({1, by_curvature}, ratio, 1 / square(sigma));
+    if (++count <= kMaxCount) return;
+    count /= 2;
+    regression.forget(0.5);
 }
 
 PrintRatios::PrintRatios() : prints_(assumed_prints()) {}
-
-PrintRatios::Kind PrintRatios::make_kind(double ratio) {
-    return {{0, 0, 1 / square(kCurvaturePrior)}, 0, 0, ratio};
-}
-
-void PrintRatios::include(Kind& kind, double ratio, double by_curvature, double sigma) {
-    const double weight = 1 / square(sigma);
-    Symmetric& A = kind.information;
-    A.xx += weight;
-    A.xy += weight * by_curvature;
-    A.yy += weight * square(by_curvature);
-    kind.by_print += weight * ratio;
-    kind.by_curvature += weight * by_curvature * ratio;
-    if (++kind.count <= kMaxCount) return;
-    kind.count /= 2;
-    for (double* sum : {&A.xx, &A.xy, &A.yy, &kind.by_print, &kind.by_curvature}) *sum /= 2;
-}
 
 /// The kind whose regression is nearest to a measurement; a new one, in place of the rarest, if none is near.
 PrintRatios::Kind& PrintRatios::kind_of(double ratio, double by_curvature) {
     Kind* best = nullptr;
     double least = kSameKind;
     for (Kind& kind : kinds_) {
-        const double expected =
-            kind.count ? kind.print() + kind.curvature() * by_curvature : kind.first_ratio;
+        double expected = kind.first_ratio;
+        if (kind.count) {
+            const auto [print, curvature] = kind.estimate().mean;
+            expected = print + curvature * by_curvature;
+        }
         if (const double off = std::abs(expected - ratio); off < least) {
             least = off;
             best = &kind;
         }
     }
     if (best) return *best;
-    if (kinds_.size() < kMaxKinds) return kinds_.emplace_back(make_kind(ratio));
+    if (kinds_.size() < kMaxKinds) return kinds_.emplace_back(Kind{ratio});
     const auto rarest = std::min_element(kinds_.begin(), kinds_.end(), [](const Kind& a, const Kind& b) {
         return std::pair(a.recurs, a.count) < std::pair(b.recurs, b.count);
     });
-    return *rarest = make_kind(ratio);
+    return *rarest = Kind{ratio};
 }
 
 /// Whether a roundel was not measured yet, or not at this distance.
@@ -112,7 +98,8 @@ bool PrintRatios::is_new(int track, double by_curvature) {
 
 /// Chooses the print of a kind that recurs: a usual one unless the regression contradicts it.
 void PrintRatios::assign(Kind& kind) {
-    const double measured = kind.print(), sigma = kind.sigma();
+    const auto [mean, cov] = kind.estimate();
+    const double measured = mean[0], sigma = std::max(Print::kPaper, std::sqrt(cov[0][0]));
     if (kind.assigned && sigma > kExact) return;
     const Print& usual = nearest_print(kUsual, measured);
     const double curvature = kind.curvature_with(usual.ratio);
@@ -160,8 +147,8 @@ bool PrintRatios::learn(const std::vector<Observation>& roundels) {
         Kind& kind = kind_of(fit->ratio, by_curvature);
         ++seen[size_t(&kind - kinds_.data())];
         if (is_new(track, by_curvature))
-            include(kind, fit->ratio, by_curvature,
-                    std::hypot(fit->ratio_sigma, kModelSigma, kSecondOrder * by_curvature));
+            kind.include(fit->ratio, by_curvature,
+                         std::hypot(fit->ratio_sigma, kModelSigma, kSecondOrder * by_curvature));
     }
     for (size_t k = 0; k < kinds_.size(); ++k) {
         kinds_[k].recurs |= seen[k] >= kMinWitnesses;
@@ -182,12 +169,8 @@ std::vector<double> PrintRatios::recurring() const {
 }
 
 void PrintRatios::forget_measurements() {
-    for (Kind& kind : kinds_) {
-        Kind empty = make_kind(kind.assigned ? kind.assigned->ratio : kind.first_ratio);
-        empty.recurs = kind.recurs;
-        empty.assigned = kind.assigned;
-        kind = empty;
-    }
+    for (Kind& kind : kinds_)
+        kind = {kind.assigned ? kind.assigned->ratio : kind.first_ratio, {}, 0, kind.recurs, kind.assigned};
     used_.clear();
 }
 

@@ -5,6 +5,7 @@
 
 #include "fit/photometric_fit.hpp"
 #include "fit/roundel_limits.hpp"
+#include "verify/learning.hpp"
 
 namespace roundel {
 
@@ -38,22 +39,17 @@ class PrintRatios {
     void forget_measurements();
 
   private:
-    /// A kind of roundels: the normal equations of its regression.
+    /// A kind of roundels.
     struct Kind {
-        Symmetric information;
-        double by_print;      // right hand side
-        double by_curvature;  // right hand side
-        double first_ratio;   // of its first roundel
-        int count = 0;        // of measurements
+        double first_ratio;          // of its first roundel
+        Regression<2> regression{};  // on the print's ratio and the curvature
+        int count = 0;               // of measurements
         bool recurs = false;
         std::optional<Print> assigned{};  // the print in use, after it recurs
-        double print() const;
-        double curvature() const;
+        void include(double ratio, double by_curvature, double sigma);
+        Regression<2>::Estimate estimate() const;         // after a measurement
         double curvature_with(double print_ratio) const;  // if that is the print
-        double sigma() const;                             // of `print`
     };
-    static Kind make_kind(double ratio);
-    static void include(Kind& kind, double ratio, double by_curvature, double sigma);
     Kind& kind_of(double ratio, double by_curvature);
     bool is_new(int track, double by_curvature);
     void assign(Kind& kind);

@@ -10,7 +10,6 @@ namespace roundel {
 
 namespace {
 
-constexpr size_t kSamples = 64;
 constexpr int kSteps = 3;
 constexpr double kModelSigma = 0.05;    // of a curvature: what the family leaves
 constexpr double kHuber = 1.5;          // standard deviations
@@ -26,42 +25,20 @@ EncodedLevel::EncodedLevel(double share) {
     by_shoulder = (cube * cube - 1) / 6;
 }
 
-void ToneCurve::include(const ToneSample& sample) {
-    if (samples_.size() < kSamples) {
-        samples_.push_back(sample);
-        return;
-    }
-    samples_[next_] = sample;
-    next_ = (next_ + 1) % kSamples;
-}
-
 double ToneCurve::light(const EncodedLevel& level) const {
     return std::exp(exponent_ * level.by_exponent + shoulder_ * level.by_shoulder);
 }
 
 double ToneCurve::light(double share) const { return light(EncodedLevel(share)); }
 
-double ToneCurve::left_by(double exponent) const {
-    double sum = 0, weights = 0;
-    for (const ToneSample& sample : samples_) {
-        const auto power = [&](const EncodedLevel& level) { return std::exp(exponent * level.by_exponent); };
-        const double dark = power(sample.dark), range = power(sample.bright) - dark;
-        if (range <= 0) continue;
-        const double left = 4 * ((power(sample.middle) - dark) / range - 0.5);
-        const double variance = square(sample.sigma) + square(kModelSigma);
-        sum += square(left) / variance - 1;
-        weights += 1 / variance;
-    }
-    return weights > 0 ? std::sqrt(std::max(0.0, sum / weights)) : 0;
-}
-
 /// Gauss-Newton with Huber's weights on the curvatures that the curve leaves in the samples, 4 (s - 1/2) with
 /// s = (L_middle - L_dark) / (L_bright - L_dark).
-void ToneCurve::fit() {
+void ToneCurve::learn(const std::vector<ToneSample>& samples) {
+    regression_.forget(kNewFrame);
+    const Regression<2> earlier = regression_;
     for (int k = 0; k < kSteps; ++k) {
-        Symmetric A{1 / square(kExponentSigma), 0, 1 / square(kShoulderSigma)};
-        double x = A.xx * (kExponent - exponent_), y = -A.yy * shoulder_;
-        for (const ToneSample& sample : samples_) {
+        regression_ = earlier;
+        for (const ToneSample& sample : samples) {
             const double dark = light(sample.dark), middle = light(sample.middle),
                          bright = light(sample.bright), range = bright - dark;
             if (range <= 0) continue;
@@ -73,16 +50,29 @@ void ToneCurve::fit() {
             };
             const double off = -4 * (share - 0.5), sigma = std::hypot(sample.sigma, kModelSigma);
             const double weight = std::min(1.0, kHuber * sigma / std::abs(off)) / square(sigma);
-            const double u = slope(&EncodedLevel::by_exponent), v = slope(&EncodedLevel::by_shoulder);
-            A.xx += weight * u * u;
-            A.xy += weight * u * v;
-            A.yy += weight * v * v;
-            x += weight * u * off;
-            y += weight * v * off;
+            const Vector<2> by{slope(&EncodedLevel::by_exponent), slope(&EncodedLevel::by_shoulder)};
+            regression_.include(by, off + by[0] * exponent_ + by[1] * shoulder_, weight);
         }
-        exponent_ += (A.yy * x - A.xy * y) / A.det();
-        shoulder_ += (A.xx * y - A.xy * x) / A.det();
+        const auto estimate =
+            regression_.solve({1 / square(kExponentSigma), 1 / square(kShoulderSigma)}, {kExponent, 0});
+        if (!estimate) return;
+        exponent_ = estimate->mean[0];
+        shoulder_ = estimate->mean[1];
     }
+}
+
+double left_by_power(double exponent, const std::vector<ToneSample>& samples) {
+    double sum = 0, weights = 0;
+    for (const ToneSample& sample : samples) {
+        const auto power = [&](const EncodedLevel& level) { return std::exp(exponent * level.by_exponent); };
+        const double dark = power(sample.dark), range = power(sample.bright) - dark;
+        if (range <= 0) continue;
+        const double left = 4 * ((power(sample.middle) - dark) / range - 0.5);
+        const double variance = square(sample.sigma) + square(kModelSigma);
+        sum += square(left) / variance - 1;
+        weights += 1 / variance;
+    }
+    return weights > 0 ? sum / weights : 0;
 }
 
 }  // namespace roundel

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
-#include <cstddef>
 #include <vector>
+
+#include "verify/learning.hpp"
 
 namespace roundel {
 
@@ -22,24 +23,22 @@ struct ToneSample {
 /// The local exponent, exponent + shoulder v^6, is that of a power for most levels and greater where a
 /// shoulder compresses bright light.
 ///
-/// A robust Gauss-Newton fit to the samples of the last roundels. One roundel determines the mean exponent
+/// A robust Gauss-Newton fit to the samples of the last frames. One roundel determines the mean exponent
 /// between its levels only; roundels in different light determine both. A prior decides what they leave.
 class ToneCurve {
   public:
-    void include(const ToneSample& sample);
-    /// Fits the curve to the samples, from its last state.
-    void fit();
-    /// RMS of the curvatures that a power leaves in the samples, beyond their noise.
-    double left_by(double exponent) const;
+    /// Includes the samples of a frame.
+    void learn(const std::vector<ToneSample>& samples);
     double light(double share) const;
-    double exponent() const { return exponent_; }
 
   private:
     double light(const EncodedLevel& level) const;
 
-    std::vector<ToneSample> samples_;
-    size_t next_ = 0;  // of the samples, to be replaced
+    Regression<2> regression_;
     double exponent_ = 1, shoulder_ = 0;
 };
+
+/// Mean square of the curvatures that a power leaves in samples, beyond their noise.
+double left_by_power(double exponent, const std::vector<ToneSample>& samples);
 
 }  // namespace roundel
