@@ -235,6 +235,25 @@ def consider(P: Array, counted: Array, responses: Array, factor: Array, /) -> Ar
     factor (8 C, 8 C): P without the part that counts these as noise. See `respond`.
     """
 
+def log_ratios(
+    A: Array,
+    nu: Array,
+    other: Array,
+    body: Index,
+    camera: Index,
+    certain: NDArray[np.bool_],
+    P: Array,
+    of_body: Index,
+    of_camera: Index,
+    /,
+) -> Array:
+    """(K,) log-likelihoods of the assignments of K bodies in a camera each, -1 for any, that are not certain, given
+    those that are, minus that as any roundels of their images.
+
+    By assignment: whitened derivatives A (N, 2, 12), innovations nu (N, 2), logarithm of the density `other` (N,), body
+    and camera (N,), certain (N,); P (B, 12, 12) of the predictions.
+    """
+
 def inverses(information: Array, /) -> Array:
     """(K, 12, 12) inverses of positive definite matrices; raises RuntimeError for others."""
 

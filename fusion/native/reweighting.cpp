@@ -2,6 +2,7 @@
 #include "reweighting.hpp"
 
 #include <algorithm>
+#include <numbers>
 #include <numeric>
 #include <span>
 #include <stdexcept>
@@ -120,6 +121,37 @@ void residuals(const EquationSystem& system, const double* steps, double* to) {
         for (int a = 0; a < 2; ++a)
             to[a * system.n_equations + k] =
                 residual(system.equations[k].A[a], steps + kErrors * system.body[k]);
+}
+
+double log_ratio(const Evidence& evidence, int64_t body, int64_t camera, const ErrorMatrix& P) {
+    // With L = P^-1 + A^T A and b = A^T nu of any assignments, det(A P A^T + I) = det P det L, and
+    // nu^T (A P A^T + I)^-1 nu = nu^T nu - b^T L^-1 b.
+    ErrorMatrix L = inverse(P);
+    ErrorVector b{};
+    double ratio = 0;
+    const auto add = [&](size_t k) {
+        for (int a = 0; a < 2; ++a)
+            for (int i = 0; i < kErrors; ++i) {
+                b[i] += evidence.A[k][a][i] * evidence.nu[k][a];
+                for (int j = 0; j <= i; ++j) L[i][j] += evidence.A[k][a][i] * evidence.A[k][a][j];
+            }
+    };
+    const auto explained = [&] {
+        const Cholesky<kErrors> factor(L);
+        const ErrorVector z = factor.halfway(b);
+        return std::inner_product(z.begin(), z.end(), z.begin(), 0.0) / 2 - factor.log_determinant() / 2;
+    };
+    for (size_t k = 0; k < evidence.count; ++k)
+        if (evidence.body[k] == body && evidence.certain[k]) add(k);
+    ratio -= explained();
+    for (size_t k = 0; k < evidence.count; ++k) {
+        if (evidence.body[k] != body || evidence.certain[k]) continue;
+        if (camera >= 0 && evidence.camera[k] != camera) continue;
+        add(k);
+        const double x = evidence.nu[k][0], y = evidence.nu[k][1];
+        ratio -= (x * x + y * y) / 2 + std::log(2 * std::numbers::pi) + evidence.other[k];
+    }
+    return ratio + explained();
 }
 
 ErrorMatrix inverse(const ErrorMatrix& H) {

@@ -40,6 +40,21 @@ void reweigh(const EquationSystem& system, ErrorMatrix* H, ErrorVector* g, doubl
 /// Writes 2 x N whitened residuals b - A delta of the steps delta (K x 12).
 void residuals(const EquationSystem& system, const double* steps, double* to);
 
+/// N linearized assignments: whitened derivatives and innovations, the logarithm of the density of other
+/// roundels, the body and the camera, and whether it is certain.
+struct Evidence {
+    const double (*A)[2][kErrors];
+    const double (*nu)[2];
+    const double* other;
+    const int64_t *body, *camera;
+    const bool* certain;
+    size_t count;
+};
+
+/// The log-likelihood of the assignments of a body in a camera, or in any (-1), that are not certain, given
+/// those that are and the covariance P of its prediction, minus that as any roundels of their images.
+double log_ratio(const Evidence& evidence, int64_t body, int64_t camera, const ErrorMatrix& P);
+
 /// The inverse of a positive definite matrix. Throws std::runtime_error for other matrices.
 ErrorMatrix inverse(const ErrorMatrix& H);
 

@@ -14,99 +14,112 @@ constexpr int kPoseErrors = 6, kFocal = 7;
 /// Sums over the equations of a body in one frame: of a a^T for the six columns of the pose, and of a times
 /// the derivative by the logarithm of the focal length.
 struct ViewSums {
-    bool is_seen;
     double by_pose[kErrors][kPoseErrors], by_focal[kErrors];
 };
 
-/// Adds the equations `first` to `last` of a body to the sums of their frames, and those counted for the
-/// cameras.
-void add(const WeightedEquations& observed, const size_t* first, const size_t* last, ViewSums* views,
-         ErrorMatrix& counted) {
-    for (; first != last; ++first) {
-        const size_t k = *first;
-        ViewSums& view = views[observed.frame[k]];
-        view.is_seen = true;
-        for (int a = 0; a < 2; ++a) {
-            const double *row = observed.system.equations[k].A[a], weight = observed.weights[k];
-            const double by_focal = observed.whiten.at(2 * a, k) * observed.xy.at(0, k) +
-                                    observed.whiten.at(2 * a + 1, k) * observed.xy.at(1, k);
-            for (int i = 0; i < kErrors; ++i) {
-                const double scaled = weight * row[i], shared = scaled * observed.rig_share[k];
-                for (int j = 0; j < kPoseErrors; ++j) view.by_pose[i][j] += scaled * row[j];
-                for (int j = 0; j < kErrors; ++j) counted[i][j] += shared * row[j];
-                view.by_focal[i] += scaled * by_focal;
-            }
+/// The columns of one camera in a response.
+using Block = std::array<std::array<double, kCameraErrors>, kErrors>;
+
+/// Adds the equations k of a body to the sums of their frame, and to what is counted for the cameras.
+ROUNDEL_CLONES void add(const WeightedEquations& observed, size_t k, ViewSums& view, ErrorMatrix& counted) {
+    const Equations equations = observed.system.equations[k];  // a copy, which cannot alias the sums
+    for (int a = 0; a < 2; ++a) {
+        const double *row = equations.A[a], weight = observed.weights[k];
+        const double by_focal = observed.whiten.at(2 * a, k) * observed.xy.at(0, k) +
+                                observed.whiten.at(2 * a + 1, k) * observed.xy.at(1, k);
+        for (int i = 0; i < kErrors; ++i) {
+            const double scaled = weight * row[i], shared = scaled * observed.rig_share[k];
+            for (int j = 0; j < kPoseErrors; ++j) view.by_pose[i][j] += scaled * row[j];
+            for (int j = 0; j < kErrors; ++j) counted[i][j] += shared * row[j];
+            view.by_focal[i] += scaled * by_focal;
         }
     }
 }
 
-/// Subtracts the sums of a view from the columns of its camera. A camera that turns by w and moves by t in
+/// Adds the sums of a view to those by the errors of its camera. A camera that turns by w and moves by t in
 /// its own frame shows the body as one that moved the other way: with the derivatives a_theta (body) and a_p
 /// (world) of an equation, g = R_cam_world a_p, those by the camera are g x t_cam - R_cam a_theta and -g.
-void subtract(const ViewSums& view, const BodyInCamera& body, const Matrix& R_cam_world, size_t d,
-              double* columns) {
+void add(const ViewSums& view, const BodyInCamera& body, const Matrix& R_cam_world, Block& sums) {
     for (int i = 0; i < kErrors; ++i) {
-        const double* sums = view.by_pose[i];
-        const Vector g = R_cam_world * Vector{sums[3], sums[4], sums[5]};
-        const Vector turn = cross(g, body.t_cam) - body.R_cam * Vector{sums[0], sums[1], sums[2]};
-        double* to = columns + i * d;
-        to[0] -= turn.x;
-        to[1] -= turn.y;
-        to[2] -= turn.z;
-        to[3] += g.x;
-        to[4] += g.y;
-        to[5] += g.z;
-        to[kFocal] -= view.by_focal[i];
+        const double* pose = view.by_pose[i];
+        const Vector g = R_cam_world * Vector{pose[3], pose[4], pose[5]};
+        const Vector turn = cross(g, body.t_cam) - body.R_cam * Vector{pose[0], pose[1], pose[2]};
+        const double by_error[kCameraErrors] = {turn.x, turn.y, turn.z, -g.x,
+                                                -g.y,   -g.z,   0,      view.by_focal[i]};
+        for (int j = 0; j < kCameraErrors; ++j) sums[i][j] += by_error[j];
     }
 }
 
 /// to (12 x n) += A (12 x 12) times B (12 x n).
-inline void add_product(const ErrorMatrix& A, const double* B, size_t n, double* to) {
+template <class Rows>
+inline void add_product(const ErrorMatrix& A, const Rows& B, double sign, Rows& to) {
     for (int i = 0; i < kErrors; ++i)
         for (int j = 0; j < kErrors; ++j) {
-            const double a = A[i][j];
-            for (size_t k = 0; k < n; ++k) to[i * n + k] += a * B[j * n + k];
+            const double a = sign * A[i][j];
+            for (size_t k = 0; k < B[0].size(); ++k) to[i][k] += a * B[j][k];
         }
 }
 
 /// Rows of the transition: rotations by angular velocities, positions by velocities; see `Transition`.
-void move(const double* T, double dt, size_t n, double* rows) {
+template <class Rows>
+inline void move(const double* T, double dt, Rows& rows) {
     for (int i = 0; i < 3; ++i)
-        for (size_t k = 0; k < n; ++k) {
-            for (int j = 0; j < 3; ++j) rows[i * n + k] += T[3 * i + j] * rows[(6 + j) * n + k];
-            rows[(3 + i) * n + k] += dt * rows[(9 + i) * n + k];
+        for (size_t k = 0; k < rows[0].size(); ++k) {
+            for (int j = 0; j < 3; ++j) rows[i][k] += T[3 * i + j] * rows[6 + j][k];
+            rows[3 + i][k] += dt * rows[9 + i][k];
         }
 }
 
-ErrorMatrix transposed_of(const ErrorMatrix& A) {
+inline ErrorMatrix transposed_of(const ErrorMatrix& A) {
     ErrorMatrix B;
     for (int i = 0; i < kErrors; ++i)
         for (int j = 0; j < kErrors; ++j) B[i][j] = A[j][i];
     return B;
 }
 
-/// F C F^T of a symmetric C.
-void move_both(const double* T, double dt, ErrorMatrix& C) {
-    for (int turn = 0; turn < 2; ++turn) {
-        move(T, dt, kErrors, C[0].data());
-        C = transposed_of(C);
-    }
-}
-
-ROUNDEL_CLONES void multiply(const ErrorMatrix& A, const double* B, size_t n, double* to) {
-    std::fill_n(to, kErrors * n, 0.0);
-    add_product(A, B, n, to);
-}
-
-/// sums (12 x n) + A (12 x 12) times B (12 x n).
-ROUNDEL_CLONES void accumulate(const ErrorMatrix& A, const double* B, size_t n, double* sums) {
-    add_product(A, B, n, sums);
-}
-
-ErrorMatrix product(const ErrorMatrix& A, const ErrorMatrix& B) {
-    ErrorMatrix to;
-    multiply(A, B[0].data(), kErrors, to[0].data());
+inline ErrorMatrix product(const ErrorMatrix& A, const ErrorMatrix& B) {
+    ErrorMatrix to{};
+    add_product(A, B, 1, to);
     return to;
+}
+
+/// A step of the part of P that counts the cameras: E F D F^T E^T + P added P.
+ROUNDEL_CLONES void step_counted(const double* T, double dt, const ErrorMatrix& E, const ErrorMatrix& P,
+                                 const ErrorMatrix& added, ErrorMatrix& D) {
+    ErrorMatrix half = D;
+    move(T, dt, half);
+    half = transposed_of(product(E, half));
+    move(T, dt, half);
+    D = product(E, half);
+    add_product(product(P, added), P, 1, D);
+}
+
+/// A step of the columns of one camera: E F S.
+ROUNDEL_CLONES void step_response(const double* T, double dt, const ErrorMatrix& E, Block& S) {
+    Block before = S;
+    move(T, dt, before);
+    S = {};
+    add_product(E, before, 1, S);
+}
+
+ROUNDEL_CLONES void subtract_product(const ErrorMatrix& P, const Block& sums, Block& S) {
+    add_product(P, sums, -1, S);
+}
+
+ROUNDEL_CLONES void gain_of(const ErrorMatrix& P, const ErrorMatrix& information, ErrorMatrix& E) {
+    E = product(P, information);
+}
+
+ErrorMatrix identity() {
+    ErrorMatrix I{};
+    for (int i = 0; i < kErrors; ++i) I[i][i] = 1;
+    return I;
+}
+
+bool is_zero(const Block& block) {
+    return std::all_of(block.begin(), block.end(), [](const auto& row) {
+        return std::all_of(row.begin(), row.end(), [](double x) { return x == 0; });
+    });
 }
 
 }  // namespace
@@ -116,27 +129,33 @@ void respond(const FramePoses& poses, const WeightedEquations& observed, const F
     const ByBody of(observed.system);
     const auto& exposures = poses.exposures();
     const size_t d = kCameraErrors * n_cameras;
-    std::vector<ViewSums> views(exposures.size());
-    std::vector<double> sums(kErrors * d);
+    std::vector<Block> sums(n_cameras);
+    std::vector<char> is_seen(n_cameras);
     for (size_t b = 0; b < observed.system.n_bodies; ++b) {
-        double* response = responses + b * kErrors * d;
-        move(steps.T + 9 * b, steps.dt[b], d, response);
-        move_both(steps.T + 9 * b, steps.dt[b], counted[b]);
-        if (of.first[b] == of.first[b + 1]) continue;
-        std::fill(views.begin(), views.end(), ViewSums{});
-        ErrorMatrix added{};
-        const size_t* indices = of.indices.data();
-        add(observed, indices + of.first[b], indices + of.first[b + 1], views.data(), added);
-        std::fill(sums.begin(), sums.end(), 0.0);
-        for (size_t f = 0; f < views.size(); ++f)
-            if (views[f].is_seen)
-                subtract(views[f], poses.at(f, b), exposures[f].R_cam_world, d,
-                         sums.data() + kCameraErrors * camera[f]);
-        accumulate(steps.information[b], response, d, sums.data());
-        multiply(steps.P[b], sums.data(), d, response);
-        const ErrorMatrix weighted = product(steps.information[b], counted[b]);
-        accumulate(weighted, steps.information[b][0].data(), kErrors, added[0].data());
-        counted[b] = product(product(steps.P[b], added), steps.P[b]);
+        std::fill(is_seen.begin(), is_seen.end(), false);
+        ErrorMatrix added{}, E = identity();
+        if (of.first[b] < of.first[b + 1]) gain_of(steps.P[b], steps.information[b], E);
+        for (size_t at = of.first[b]; at < of.first[b + 1];) {
+            const int64_t f = observed.frame[of.indices[at]], c = camera[f];
+            ViewSums view{};
+            for (; at < of.first[b + 1] && observed.frame[of.indices[at]] == f; ++at)
+                add(observed, of.indices[at], view, added);
+            if (!is_seen[c]) sums[c] = {};
+            is_seen[c] = true;
+            add(view, poses.at(f, b), exposures[f].R_cam_world, sums[c]);
+        }
+        const double *T = steps.T + 9 * b, dt = steps.dt[b];
+        step_counted(T, dt, E, steps.P[b], added, counted[b]);
+        for (size_t c = 0; c < n_cameras; ++c) {
+            double* columns = responses + b * kErrors * d + c * kCameraErrors;
+            Block S;
+            for (int i = 0; i < kErrors; ++i) std::copy_n(columns + i * d, kCameraErrors, S[i].data());
+            const bool is_known = !is_zero(S);
+            if (!is_known && !is_seen[c]) continue;  // it has never seen the body
+            if (is_known) step_response(T, dt, E, S);
+            if (is_seen[c]) subtract_product(steps.P[b], sums[c], S);
+            for (int i = 0; i < kErrors; ++i) std::copy_n(S[i].data(), kCameraErrors, columns + i * d);
+        }
     }
 }
 
@@ -152,6 +171,7 @@ ROUNDEL_CLONES void consider(const ErrorMatrix* P, const ErrorMatrix* counted, c
         for (int i = 0; i < kErrors; ++i)
             for (size_t j = 0; j < d; ++j) {
                 const double s = S[i * d + j];
+                if (s == 0) continue;  // of a camera that has never seen the body
                 for (size_t k = begin[j]; k <= j; ++k) scaled[i * d + k] += s * factor[j * d + k];
             }
         for (int i = 0; i < kErrors; ++i)

@@ -208,7 +208,6 @@ LEARNED = 8  # frames of a camera that define the usual number of detections of 
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
 # Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
 CHANGED = np.log(0.02)
-LOG_2PI = np.log(2 * np.pi)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,29 +217,6 @@ class _Changes:
     fallen: Mask
     unseen: Mask
     cost: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Evidence:
-    """Linearized assignments: whitened derivatives A (N, 2, 12), innovations nu (N, 2), and the logarithm of the
-    density `other` (N,) of other roundels, in units of whitened centres."""
-
-    A: Array
-    nu: Array
-    other: Array
-
-    def log_ratio(self, new: Mask, beside: Mask, P: Array) -> float:
-        """Log-likelihood of assignments `new` as those of their robot, minus that as any roundels of their images.
-
-        The likelihood is conditional on the robot's assignments `beside`; `P` (12, 12) is the robot's prediction.
-        """
-        order = np.concatenate([np.flatnonzero(beside), np.flatnonzero(new)])
-        A, nu = self.A[order].reshape(-1, 12), self.nu[order].ravel()
-        L = np.linalg.cholesky(A @ P @ A.T + np.eye(len(nu)))
-        n = 2 * int(new.sum())
-        z, pivots = np.linalg.solve(L, nu)[-n:], np.diag(L)[-n:]
-        likelihood = -0.5 * (z @ z + n * LOG_2PI) - np.log(pivots).sum()
-        return float(likelihood - self.other[new].sum())
 
 
 class OwnDetections:
@@ -287,25 +263,22 @@ class OwnDetections:
         n_cameras = self._shape[1]
         rows = np.flatnonzero((changes.fallen | changes.unseen.any(1))[view // n_cameras])
         robot, camera = np.divmod(view[rows], n_cameras)
-        evidence = self._evidence(given, rows)
-        groups = [(robot == k, changes.cost[k] - CHANGED) for k in np.flatnonzero(changes.fallen).tolist()]
-        groups += [((robot == k) & (camera == c), CHANGED) for k, c in np.argwhere(changes.unseen).tolist()]
-        accepted = np.zeros(len(rows), bool)
-        for new, prior in groups:
-            k = robot[np.argmax(new)]
-            accepted[new] = (
-                prior + evidence.log_ratio(new, certain[rows] & (robot == k), given.states.P[k]) > 0
-            )
-        return rows[accepted]
-
-    def _evidence(self, given: AssignedFrames, rows: Index) -> _Evidence:
         observations = MatchedObservations.of(given.assignments.select(rows), given.detections, self._markers)
         A, nu = self._estimator.innovations(given.states, observations)
         cov, frame = observations.detections.cov, observations.detections.frame
-        # Of pixels instead of whitened centres.
+        # The density of other roundels, of pixels instead of whitened centres.
         log_area = 0.5 * np.log(cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2)
-        log_any = np.log(self._density(given.detections)[frame])
-        return _Evidence(A.reshape(-1, 2, 12), nu.reshape(-1, 2), log_area + log_any)
+        other = log_area + np.log(self._density(given.detections)[frame])
+        fallen, (seen, by) = np.flatnonzero(changes.fallen), np.nonzero(changes.unseen)
+        of_robot, of_camera = np.concatenate([fallen, seen]), np.concatenate([np.full(len(fallen), -1), by])
+        prior = np.concatenate([changes.cost[fallen] - CHANGED, np.full(len(seen), CHANGED)])
+        evidence = A.reshape(-1, 2, 12), nu.reshape(-1, 2), other, robot, camera, certain[rows]
+        ratio = _core.log_ratios(*evidence, given.states.P, of_robot, of_camera)
+        accepted = np.zeros(self._shape, bool)
+        is_own = prior + ratio > 0
+        accepted[fallen] = is_own[: len(fallen), None]
+        accepted[seen, by] = is_own[len(fallen) :]
+        return rows[accepted[robot, camera] & ~certain[rows]]
 
     def _density(self, detections: DetectionTable) -> Array:
         """(F,) detections per pixel^2 in the frames up to the last one with a detection."""

@@ -28,6 +28,11 @@ class Cholesky {
         }
     }
     bool positive() const { return positive_; }
+    double log_determinant() const {
+        double sum = 0;
+        for (const double x : per_diagonal_) sum -= 2 * std::log(x);
+        return sum;
+    }
     /// Solves A x = b.
     Vector<N> solve(const Vector<N>& b) const { return solve_tail<N>(halfway(b)); }
     /// L^-1 b: the square of its norm is b^T A^-1 b.

@@ -19,6 +19,27 @@ Out inverses(const Covariances& information) {
     return covariances;
 }
 
+Out log_ratios(const In<double, -1, 2, 12>& A, const In<double, -1, 2>& nu, const Numbers& other,
+               const Index& body, const Index& camera, const Mask& certain, const Covariances& P,
+               const Index& of_body, const Index& of_camera) {
+    const size_t n = body.size(), n_asked = of_body.size();
+    require_equal(n, {A.shape(0), nu.shape(0), other.size(), camera.size(), certain.size()});
+    require_equal(n_asked, {of_camera.size()});
+    below(P.shape(0), of_body);
+    const Evidence evidence{reinterpret_cast<const double (*)[2][kErrors]>(A.data()),
+                            reinterpret_cast<const double (*)[2]>(nu.data()),
+                            other.data(),
+                            body.data(),
+                            camera.data(),
+                            certain.data(),
+                            n};
+    auto [ratios, to] = make({n_asked});
+    for (size_t k = 0; k < n_asked; ++k)
+        to[k] = log_ratio(evidence, of_body(k), of_camera(k),
+                          reinterpret_cast<const ErrorMatrix*>(P.data())[of_body(k)]);
+    return ratios;
+}
+
 auto eliminate_bodies(const In<double, -1, 2, 21>& equations, const Numbers& weights, const Index& body,
                       const Index& camera, const In<double, -1, 12>& information,
                       const In<double, -1, 12>& right, size_t n_cameras, double damping) {
@@ -67,6 +88,7 @@ void bind_equations(nb::module_& m) {
     m.attr("CAUCHY") = kCauchy;
     m.attr("NOMINAL_WEIGHT") = kNominalWeight;
     m.def("predict", &predict_bodies);
+    m.def("log_ratios", &log_ratios);
     m.def("eliminate_bodies", &eliminate_bodies);
     m.def("inverses", &inverses);
 }

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
+from scipy.stats import multivariate_normal
 
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
@@ -120,6 +121,27 @@ def test_a_fit_is_reweighted_least_squares_of_the_bodies_that_still_move():
         assert_near(estimates.minus(states.retract(delta)), np.zeros((BODIES, 12)))
         moving = moving[moving != 2]
     assert_near(fit.covariances(states.P)[moving], np.linalg.inv(H)[moving])
+
+
+def test_likelihoods_are_those_of_the_innovations():
+    random = np.random.default_rng(9)
+    n, of_body, of_camera = 60, np.array([0, 1, 2, 2]), np.array([-1, 0, 1, 2])
+    A, nu, other = random.normal(size=(n, 2, 12)), random.normal(size=(n, 2)), random.normal(size=n)
+    (body, camera), certain = random.integers(0, 3, (2, n)), random.random(n) < 0.5
+    root = random.normal(size=(3, 12, 20))
+    P = root @ root.transpose(0, 2, 1)
+    found = _core.log_ratios(A, nu, other, body, camera, certain, P, of_body, of_camera)
+    for k, b, c in zip(range(len(of_body)), of_body, of_camera, strict=True):
+        beside, new = ((body == b) & mask for mask in (certain, ~certain & ((c < 0) | (camera == c))))
+        both = np.concatenate([np.flatnonzero(beside), np.flatnonzero(new)])
+        likelihoods = []
+        for rows in (both, np.flatnonzero(beside)):
+            J = A[rows].reshape(-1, 12)
+            normal = multivariate_normal(np.zeros(len(J)), J @ P[b] @ J.T + np.eye(len(J)))
+            likelihoods.append(normal.logpdf(nu[rows].ravel()))
+        assert_near(found[k], likelihoods[0] - likelihoods[1] - other[new].sum())
+    with pytest.raises(IndexError):
+        _core.log_ratios(A, nu, other, body, camera, certain, P, of_body + 1, of_camera)
 
 
 def test_prediction_equals_the_motion_model():

@@ -80,6 +80,10 @@ CALLS = {
             *(np.ones(N, bool), np.ones(N, bool), P, np.zeros((N, 2, 13))),
         ),
     ),
+    "log_ratios": (
+        _core.log_ratios,
+        (np.ones((N, 2, 12)), np.ones((N, 2)), np.ones(N), BODY, FRAME, np.zeros(N, bool), P, BODY, FRAME),
+    ),
     "inverses": (_core.inverses, (P,)),
     "Viewpoints": (_core.Viewpoints, VIEWPOINT_ARRAYS),
     "densest_ranges": (
@@ -94,8 +98,8 @@ CALLS = {
     ),
     "look_up": (_core.look_up, (np.zeros((4, 5, 20)), 32.0, np.zeros((N, 2)), np.ones((N, 2)), np.ones(N))),
 }
-# Constructors check the indices only where they know what the indices refer to.
-UNCHECKED = {"DiscColumns", "DetectionColumns"}
+# Constructors check the indices only where they know what the indices refer to; `log_ratios` only compares cameras.
+UNCHECKED = {"DiscColumns", "DetectionColumns", "log_ratios"}
 ANY_LENGTH = {"inverses", "look_up", "Viewpoints"}  # functions of arrays whose lengths are independent
 
 
