@@ -9,7 +9,7 @@
 namespace roundel::fusion {
 namespace {
 
-constexpr int kPoseErrors = 6, kFocal = 7;
+constexpr int kPoseErrors = 6;
 
 /// Sums over the equations of a body in one frame: of a a^T for the six columns of the pose, and of a times
 /// the derivative by the logarithm of the focal length.
