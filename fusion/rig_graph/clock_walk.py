@@ -76,13 +76,23 @@ class ClockWalk:
         others = [k for k in self.departed if k != camera]
         self.departed = [*others, camera][max(0, len(others) + 2 - self._n) :]
 
-    def update(self, t_ns: int, H: Array, y: Array) -> None:
-        """Add keyframes: least squares H e = y, (8 C, 8 C) and (8 C,), about the cameras' errors at their mean time."""
+    def update(self, t_ns: int, H: Array, y: Array) -> bool:
+        """Add keyframes: least squares H e = y, (8 C, 8 C) and (8 C,), about the cameras' errors at their mean time.
+
+        Keyframes that contradict the estimate beyond chance show that a camera moved, even if less than what
+        `judge` finds: its pose must not look like a clock. They are not used, and poses are forgotten; returns False.
+        """
         self._predict(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
         self._t_ns, seen = t_ns, slice(0, len(y))
         P = np.linalg.solve(np.eye(len(self.P)) + self.P[:, seen] @ np.pad(H, ((0, 0), (0, self._n))), self.P)
+        off = y - H @ self.x[seen]
+        explained = np.linalg.solve(H + np.diag(np.tile(FREE_SIGMA**-2, self._n)), off) - P[seen, seen] @ off
+        if off @ explained > chdtri(len(y), FALSE_ALARM):
+            self.forget_poses()
+            return False
         self.P = (P + P.T) / 2
-        self.x = self.x + self.P[:, seen] @ (y - H @ self.x[seen])
+        self.x = self.x + self.P[:, seen] @ off
+        return True
 
     def _predict(self, dt: float) -> None:
         F, Q = np.eye(len(self.x)), np.zeros_like(self.P)

@@ -252,8 +252,8 @@ class RigMonitor:
         if measured is None:
             return
         self._measured_ns = self._given_ns
-        self._walk.update(*measured)
-        self._departures = self._walk.take_departures()
+        if self._walk.update(*measured):
+            self._departures = self._walk.take_departures()
 
     def _note_undecided(self, names: tuple[str, ...]) -> None:
         """Log cameras that contradict each other when that begins, and when it ends."""

@@ -83,3 +83,20 @@ def test_the_filter_is_least_squares_of_all_keyframes():
         np.linalg.inv(H) / np.outer(scale, scale),
         atol=1e-9,
     )
+
+
+def test_a_camera_that_moved_does_not_look_like_a_clock():
+    """Images of a window depend on the pose and the clock of a camera alike; the pose changes once, by 1 mrad."""
+    rng, n, start_ns, deviations = np.random.default_rng(6), 3, 10**18, []
+    for _ in range(20):
+        walk, moved = ClockWalk(n), np.zeros(n * ERRORS)
+        for k in range(12):
+            moved[:3] = 1e-3 if k >= 6 else 0.0
+            A = 1e4 * rng.normal(size=(60, n * ERRORS))
+            is_used = walk.update(
+                start_ns + k * 600_000_000, A.T @ A, A.T @ (A @ moved + rng.normal(size=60))
+            )
+            assert is_used == (k != 6)
+            assert not is_used or not walk.take_departures()
+        deviations.append(walk.x[walk.offsets] / np.sqrt(np.diag(walk.P)[walk.offsets]))
+    assert np.mean(np.square(deviations)) < 1.7  # chi-square with 60 degrees of freedom, one in a thousand
