@@ -6,9 +6,10 @@ import io
 import select
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from camera_node.foundation.program import exit_code
@@ -35,14 +36,20 @@ def running(module: str, *words: object, **options: Any) -> Iterator[subprocess.
 def run_program(program: str, *words: object) -> subprocess.CompletedProcess[str]:
     """The exit code of `python -m PROGRAM ...`, and what it prints but for its log: in this process, because a start of
     Python takes longer than most commands."""
-    execute, out, err = import_module(f"{program}.__main__").execute, io.StringIO(), io.StringIO()
-    with chdir(ROOT), redirect_stdout(out), redirect_stderr(err):
+    arguments = [*map(str, words)]
+    return run_here(lambda: import_module(f"{program}.__main__").execute(arguments), ROOT)
+
+
+def run_here(execute: Callable[[], int | None], folder: Path) -> subprocess.CompletedProcess[str]:
+    """The same of a command that `execute` runs, in a folder."""
+    out, err = io.StringIO(), io.StringIO()
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
         try:
-            code = exit_code(lambda: execute([*map(str, words)]))
+            code = exit_code(execute)
         except SystemExit as end:  # of --help
             code = end.code
     assert isinstance(code, int)
-    return subprocess.CompletedProcess([program, *map(str, words)], code, out.getvalue(), err.getvalue())
+    return subprocess.CompletedProcess((), code, out.getvalue(), err.getvalue())
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import pytest
 from tests.conftest import ROOT, free_port
 from tests.security.lab import certificates
 from tests.waiting import wait_for_port
-from tests.web.roundel.programs import Program, roundel, roundel_command
+from tests.web.roundel.programs import Program, roundel_command, roundel_process
 
 CONTRAST = ("--min-contrast", 40)
 
@@ -57,18 +57,19 @@ def test_all_programs_work_with_their_certificates(running: tuple[Program, Progr
     member = ("--connect", endpoint, "--zenoh", "member.json5")
     with ThreadPoolExecutor() as pool:  # each refused command waits for an answer until its time is over
         refused = {
-            name: pool.submit(roundel, "settings", name, *member, folder=keys / "viewer", expected=2)
+            name: pool.submit(roundel_process, "settings", name, *member, folder=keys / "viewer")
             for name in ("north", "south")
         }
         bare = ("cameras", "list", "--connect", endpoint)
-        unknown = pool.submit(roundel, *bare, folder=keys, expected=2)
+        unknown = pool.submit(roundel_process, *bare, folder=keys)
         for name in ("north", "south"):
-            assert "min_contrast: 40" in roundel(
-                "settings", name, *CONTRAST, *member, folder=keys / "operator"
-            )
-        assert "north" in roundel("cameras", "list", *member, folder=keys / "viewer")
+            done = roundel_process("settings", name, *CONTRAST, *member, folder=keys / "operator")
+            assert "min_contrast: 40" in done.stdout
+        assert "north" in roundel_process("cameras", "list", *member, folder=keys / "viewer").stdout
         for name, answer in refused.items():
-            assert f"camera '{name}' does not answer" in answer.result()
-        assert "error: " in unknown.result()
+            assert answer.result().returncode == 2
+            assert f"camera '{name}' does not answer" in answer.result().stderr
+        assert unknown.result().returncode == 2
+        assert "error: " in unknown.result().stderr
     assert camera.stop() == 0
     assert up.stop() == 0

@@ -10,7 +10,9 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from tests.processes import run_here
 from tests.waiting import DEADLINE_S, poll
+from web.roundel.command import execute
 
 MAIN = "from web.roundel.command import main; main()"
 
@@ -69,8 +71,17 @@ class Program:
 
 
 def roundel(*words: object, folder: Path, expected: int = 0) -> str:
-    """Run a command to its end; return what it printed."""
-    command = roundel_command(*words)
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    """Run a command to its end, in this process; return what it printed, but for its log."""
+    done = run_here(lambda: execute(*map(str, words)), folder)
     assert done.returncode == expected, done.stdout + done.stderr
     return done.stdout + done.stderr
+
+
+def roundel_process(
+    *words: object, folder: Path | None = None, **env: str
+) -> subprocess.CompletedProcess[str]:
+    """The same in a process of its own, which is in no checkout."""
+    command = roundel_command(*words)
+    return subprocess.run(
+        command, cwd=folder, env={**os.environ, **env}, capture_output=True, text=True, timeout=DEADLINE_S
+    )

@@ -2,7 +2,6 @@
 """The command `roundel`: its commands, their help, and mistakes in the command line."""
 
 import contextlib
-import os
 import re
 import subprocess
 import sys
@@ -13,23 +12,10 @@ import pytest
 
 from camera_node.foundation.command_line import Command
 from camera_node.foundation.errors import ConfigError
+from tests.web.roundel.programs import MAIN, roundel_process
 from web.roundel.command import COMMANDS, execute
 
 WORK = ("up", "camera", "print", "calibrate", "define", "record", "ros2")  # in its order
-MAIN = "from web.roundel.command import main; main()"
-
-
-def roundel(*words: str, folder: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own, which is in no checkout."""
-    return subprocess.run(
-        [sys.executable, "-P", "-c", MAIN, *words],
-        cwd=folder,
-        env={**os.environ, **env},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
 
 
 def with_groups(commands: Sequence[Command], before: str = "") -> list[tuple[str, Command]]:
@@ -50,7 +36,7 @@ def mistake(*words: str) -> str:
 
 def test_the_list_of_commands_is_complete(tmp_path: Path):
     """Without a command, all of them in the order of the work, each with a summary."""
-    text = roundel(folder=tmp_path).stdout
+    text = roundel_process(folder=tmp_path).stdout
     listed = re.findall(r"^  (\w+) +\w", text, re.MULTILINE)
     assert sorted(listed) == sorted(command.name for command in COMMANDS)
     assert [name for name in listed if name in WORK] == list(WORK)
@@ -140,6 +126,6 @@ def test_opencv_writes_no_warning(tmp_path: Path):
     board = ("--board", "chessboard:4x5:0.05", "--out", "rig.yaml")
     for name, words in (("x.png", ("detect",)), ("x.mp4", ("calibrate", "intrinsics", *board, "--frames"))):
         (tmp_path / name).write_bytes(b"\x89PNG not a picture")
-        done = roundel(*words, name, folder=tmp_path)
+        done = roundel_process(*words, name, folder=tmp_path)
         assert done.returncode == 2
         assert re.fullmatch(r"error: .*\n", done.stderr), done.stderr
