@@ -25,7 +25,9 @@ def test_a_bend_is_removed_from_the_outline_and_its_unknown_part_is_claimed(diam
     assert measured.size < CLAIM
 
 
-@pytest.mark.parametrize(("bend", "diameter", "share"), [(0.05, 160, 0.9), (0.03, 300, 0.8)])
+@pytest.mark.parametrize(
+    ("bend", "diameter", "share"), [(0.05, 160, 0.9), pytest.param(0.03, 300, 0.8, marks=pytest.mark.slow)]
+)
 def test_strongly_bent_paper_is_found_when_large(bend, diameter, share):
     """Edges are displaced in proportion to the size: at full size alone, 5 of 8 of 300 px are found."""
     measured = measure_bend(RUN, bend, diameter, 8)

@@ -10,22 +10,24 @@ from tests.benchmarks.faults.arena import small_load
 from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.faults.world import CameraFault
 
-SECONDS = 20.0
 pytestmark = pytest.mark.computed
 
 
 @pytest.mark.parametrize(
-    ("kinds", "seed"),
+    ("seconds", "kinds", "seed"),
     [
-        (("camera frozen", "camera moved", "clock stepped"), 3),
-        pytest.param(("clock drifts",), 7, marks=pytest.mark.slow),
+        (5.0, ("camera moved",), 3),
+        pytest.param(20.0, ("camera frozen", "camera moved", "clock stepped"), 3, marks=pytest.mark.slow),
+        pytest.param(20.0, ("clock drifts",), 7, marks=pytest.mark.slow),
     ],
 )
-def test_a_faulty_camera_makes_no_pose_wrong(kinds: tuple[str, ...], seed: int, tmp_path: Path):
+def test_a_faulty_camera_makes_no_pose_wrong(
+    seconds: float, kinds: tuple[str, ...], seed: int, tmp_path: Path
+):
     """Before, 442 poses were wrong by up to 0.5 m in 90 s of the first, and a third of the drifts were not reported."""
-    *_, result = virtual_chaos(tmp_path, SECONDS, seed, kinds)
+    *_, result = virtual_chaos(tmp_path, seconds, seed, kinds)
     assert isinstance(result, ChaosResult)
-    assert result.poses > 5000
+    assert result.poses > 250 * seconds  # of ten robots at 30 Hz
     assert result.failures() == []
     assert result.rms_m < 0.002
 

@@ -132,10 +132,11 @@ def test_no_detection_is_in_two_markers():
         assert len(np.unique(marker.cameras)) == len(marker.cameras) >= 2
 
 
-def test_two_hundred_robots_are_acquired_at_once():
-    """800 markers, of which a camera sees more than 600. Half of the robots must be tracked from the second frame set,
+@pytest.mark.parametrize("robots", [80, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_crowd_is_acquired_at_once(robots: int):
+    """800 markers of 200 robots, of which a camera sees more than 600. Half of the robots must be tracked from the second frame set,
     all within 0.15 s, and never under a wrong name. The first frame set has frames of half of the cameras only."""
-    load = Load(200, 4, 8, 60.0)
+    load = Load(robots, 4, 8, 60.0)
     tracker, synchronizer, tracked = Tracker(load.rig, load.bodies), FrameSynchronizer(16_666_667), []
     for frame in load.frames(0.2):
         synchronizer.add(frame)
@@ -145,8 +146,8 @@ def test_two_hundred_robots_are_acquired_at_once():
         rows = tracker.table.tracked
         assert (np.linalg.norm(tracker.table.states.p - truth.p, axis=1)[rows] < WRONG_M).all()
         tracked.append(int(rows.sum()))
-    assert tracked[1] > 100
-    assert tracked[-1] == 200
+    assert tracked[1] > robots / 2
+    assert tracked[-1] == robots
 
 
 def test_cold_starts_with_missing_frames_acquire_no_wrong_robot():
