@@ -28,7 +28,7 @@ from web.state.feed import ArenaState
 from web.state.subscription import Subscription
 from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_content, set_property
 
-MARKERS_S = 1.0  # age up to which the latest markers can be selected
+MARKERS_S = 1.0  # age up to which markers can be selected: one may be missing in single messages
 MEASURE_S = 1.5  # for which the markers of the new robot are measured
 SAME_M = 0.05  # distance up to which a measured marker is the selected one
 NOTHING_SEEN = "no unlabeled marker in view: place the robot, markers up, where two cameras see it"
@@ -46,7 +46,8 @@ class MarkerPicker:
     def __init__(self, server: viser.ViserServer, subscription: Subscription) -> None:
         self.selected: list[Array] = []  # positions (3,), world
         self._subscription = subscription
-        self._unlabeled = np.empty((0, 3))  # current positions of unlabeled markers that several cameras see
+        self._unlabeled = np.empty((0, 3))  # positions of unlabeled markers that several cameras saw lately
+        self._seen_lately: dict[float, Array] = {}  # by the time of their message, the feed's seconds
         self._active = False
         place = server.gui.add_folder("New robot")
         with place:
@@ -77,8 +78,10 @@ class MarkerPicker:
         timed = state.markers
         if timed is not None and state.age_s(timed) < MARKERS_S:
             rows = timed.message.unlabeled()
-            self._unlabeled = timed.message.positions()[rows]
+            self._seen_lately[timed.received_s] = timed.message.positions()[rows]
             set_content(self._seen, small(describe_unlabeled(timed.message.diameters()[rows])))
+        self._seen_lately = {s: at for s, at in self._seen_lately.items() if state.now_s - s < MARKERS_S}
+        self._unlabeled = np.vstack([np.empty((0, 3)), *self._seen_lately.values()])
         is_next = next_step(state) == "robots"
         set_property(self._button, "color", PRIMARY if is_next and not self.selected else GREY)
         set_property(self._button, "disabled", not self._active and not len(self._unlabeled))
@@ -88,10 +91,11 @@ class MarkerPicker:
 
     def select(self, origin: ArrayLike, direction: ArrayLike) -> None:
         """Select the marker nearest to a ray (world), or deselect it."""
-        row = nearest_to_ray(self._unlabeled, origin, direction) if self._active else None
+        unlabeled = self._unlabeled  # the thread that draws replaces it
+        row = nearest_to_ray(unlabeled, origin, direction) if self._active else None
         if row is None:
             return
-        marker = self._unlabeled[row]
+        marker = unlabeled[row]
         others = [point for point in self.selected if np.linalg.norm(point - marker) > SAME_M]
         self.selected = others if len(others) < len(self.selected) else [*self.selected, marker]
         self._answer_with(

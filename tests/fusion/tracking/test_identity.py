@@ -134,8 +134,9 @@ def test_no_detection_is_in_two_markers():
 
 @pytest.mark.parametrize("robots", [80, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_crowd_is_acquired_at_once(robots: int):
-    """800 markers of 200 robots, of which a camera sees more than 600. Half of the robots must be tracked from the second frame set,
-    all within 0.15 s, and never under a wrong name. The first frame set has frames of half of the cameras only."""
+    """800 markers of 200 robots, of which a camera sees more than 600. Half of the robots must be tracked from the
+    second frame set, all within 0.15 s, and never under a wrong name. The first frame set has frames of half of the
+    cameras only."""
     load = Load(robots, 4, 8, 60.0)
     tracker, synchronizer, tracked = Tracker(load.rig, load.bodies), FrameSynchronizer(16_666_667), []
     for frame in load.frames(0.2):
