@@ -140,9 +140,15 @@ def _fields(info: msgspec.inspect.Type, steps: list[str]) -> list[str]:
 
 def dump_yaml(data: msgspec.Struct) -> str:
     """Encode a struct as YAML, with short lists on one line; structs with `omit_defaults` omit default values."""
-    return yaml.dump(
-        msgspec.to_builtins(data), Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True
-    )
+    plain = msgspec.to_builtins(data, enc_hook=_without_numpy)
+    return yaml.dump(plain, Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True)
+
+
+def _without_numpy(value: Any) -> Any:
+    """NumPy's numbers and arrays, of which programs of users make cameras and robots, as Python's."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise NotImplementedError
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

@@ -124,13 +124,14 @@ class CameraArray:
         focal: (C,) mean focal lengths, pixels.
         covariance: (8 C, 8 C) of the errors of the cameras; see `calib.rig.camera_errors`.
         error_px: (C,) what these errors displace in the images, RMS of a coordinate.
-        revision: counts the changes of camera poses.
+        error_scale: factor of the standard deviations that the rig states.
+        revision: counts the changes of camera poses and of their errors.
     """
 
-    def __init__(self, cameras: dict[str, Camera]) -> None:
+    def __init__(self, cameras: dict[str, Camera], error_scale: float = 1.0) -> None:
         self.names = tuple(cameras)
         self.index = {name: k for k, name in enumerate(cameras)}
-        self._cameras = dict(cameras)
+        self._cameras, self.error_scale = dict(cameras), error_scale
         self.revision = 0
         for camera in cameras.values():
             table_of(camera)  # so that the first frame does not wait for it
@@ -156,13 +157,20 @@ class CameraArray:
             self.revision += 1
             self._update()
 
+    def scale_errors(self, scale: float) -> None:
+        """Count the errors that the rig states this many times as large."""
+        if scale != self.error_scale:
+            self.error_scale = scale
+            self.revision += 1
+            self._update()
+
     def _update(self) -> None:
         cameras = self._cameras.values()
         T = np.array([camera.matrix() for camera in cameras]).reshape(-1, 4, 4)
         self.R_cam_world = np.ascontiguousarray(T[:, :3, :3].transpose(0, 2, 1))
         self.centres = np.ascontiguousarray(T[:, :3, 3])
         self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
-        self.covariance = error_covariance(list(cameras))
+        self.covariance = self.error_scale**2 * error_covariance(list(cameras))
         self.error_px = image_errors(list(cameras), self.covariance)
 
     def frame_poses(self, states: States, exposures: Exposures) -> _core.FramePoses:

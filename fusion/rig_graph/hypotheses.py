@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtri, exp1
 
-from calib.rig.camera_errors import ERRORS
+from calib.rig.camera_errors import ERRORS, covariance_factor
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
@@ -38,6 +38,10 @@ BEHIND = 1e6  # squared residual of a disc that is behind its camera
 ADEQUATE = 1.5  # ratio of the mean robust cost to that of noise, up to which a model explains the residuals
 MIN_FOR_PAIRS = 3  # cameras; of fewer, two are no minority
 MAX_SUSPECTS = 4  # cameras that are combined to pairs: those that explain most alone
+SCALES = 2.0 ** np.arange(
+    -4, 4.25, 0.25
+)  # factors of the errors that the calibration states; beyond, in rounds
+ROUNDS = 4  # of them: robust weights rise as errors are explained
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,12 +218,14 @@ class Verdict:
         cameras: at fault; if the data do not decide, those that contradict each other; empty without a fault.
         fit: of the best hypothesis.
         misfit: mean squared residual without a fault in units of its expectation, not below 1.
+        scale: of the errors that the calibration states, without a fault of single cameras.
     """
 
     cause: Cause | None
     cameras: tuple[int, ...]
     fit: Fit
     misfit: float = 1.0
+    scale: float = 1.0
 
 
 def retract(T: Array, errors: Array) -> Array:
@@ -240,15 +246,51 @@ def judge(window: Window, starts: Array) -> Verdict:
     n = len(window.names)
     none = fit(window, Hypothesis.of(None, (), n))
     if not is_contradicted(none, n):
-        return Verdict(None, (), none)
+        return Verdict(None, (), none, scale=_most_likely_scale(window, none))
+    verdict = replace(_compare(window, none, starts), misfit=none.misfit)
+    return verdict if verdict.cause else replace(verdict, scale=error_scale(window, none))
+
+
+def _compare(window: Window, none: Fit, starts: Array) -> Verdict:
+    n = len(window.names)
     everything = fit(window, Hypothesis.of(None, range(n), n, starts))
     if not everything.is_adequate():  # nor is any other hypothesis
-        return Verdict(None, tuple(range(n)), everything, none.misfit)
+        return Verdict(None, tuple(range(n)), everything)
     fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in range(n)]
     if n > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
-    return replace(decide([none, *fits, everything], n), misfit=none.misfit)
+    return decide([none, *fits, everything], n)
+
+
+def error_scale(window: Window, none: Fit) -> float:
+    """How many times as large as the calibration states the errors of all cameras are, if that is what a window shows:
+    the maximum of the marginal likelihood (MacKay 1992), cameras and robots integrated out.
+
+    Args:
+        window: the keyframes.
+        none: the fit without a fault.
+    """
+    scale = 1.0
+    for _ in range(ROUNDS):
+        factor = _most_likely_scale(window, none)
+        scale *= factor
+        if factor < SCALES[-1] ** 0.25:
+            break
+        window = replace(window, prior=factor**2 * window.prior)
+        none = fit(window, none.hypothesis)
+    return scale
+
+
+def _most_likely_scale(window: Window, none: Fit) -> float:
+    """The best of `SCALES`, by the linearized problem: with S the prior, A the information of the window about the
+    errors x of the cameras and b = A x at its maximum, log L = (b^T (A + S^-1)^-1 b - log det(I + S A)) / 2."""
+    A, b = none.reduced[:, :-1] / none.variance, none.reduced @ np.append(none.errors.ravel(), 1.0)
+    L = covariance_factor(window.prior)
+    information, directions = np.linalg.eigh(L.T @ A @ L)
+    seen = np.outer(SCALES**2, np.maximum(information, 0.0))
+    gain = np.outer(SCALES**2, (directions.T @ (L.T @ b / none.variance)) ** 2) / (1 + seen) - np.log1p(seen)
+    return float(SCALES[gain.sum(axis=1).argmax()])
 
 
 def is_contradicted(none: Fit, n_cameras: int) -> bool:

@@ -67,6 +67,8 @@ USUAL = (
 CONFIRMED = 3  # checks that do not decide, before that is reported
 MAX_SIGMA_PX = 0.3  # of an accepted pose, at the markers that show it
 MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be far off either
+LARGE = 2.0  # factor of the rig's errors that is reported
+FALL = 0.5**0.125  # of that factor in a window that contradicts nothing
 MAX_KNOWN = 4  # poses of a camera, to which it may return
 
 
@@ -81,7 +83,6 @@ class RigMonitor:
         excluded: names of moved cameras whose poses are not known yet.
         pinned: names of cameras whose poses a user confirmed; these do not change.
         contradicting: names of the cameras of which some are at fault, but the data do not decide which.
-        widening: factor of the variances of positions while cameras contradict each other.
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
     """
 
@@ -97,7 +98,7 @@ class RigMonitor:
         self._given_ns = self._measured_ns = 0  # of the last keyframes of the last job, and of the walk
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._was_doubtful = False
-        self.widening, self._claim_m = 1.0, 0.0  # a detection's claimed error at its robot, metres
+        self._size_m = 0.0  # of what contradicts, at the robots
         self.executor: Executor | None = None
         self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
         self.excluded: set[str] = set()
@@ -108,6 +109,7 @@ class RigMonitor:
         """Continue with the same cameras and other robots."""
         self.inherit_poses(old)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
+        self._cameras.scale_errors(old._cameras.error_scale)
 
     def inherit_poses(self, old: "RigMonitor") -> None:
         """The poses that another monitor of the same cameras knows, and those that a user confirmed."""
@@ -142,8 +144,8 @@ class RigMonitor:
             Contradiction(
                 kind="undecided",
                 names=self.contradicting,
-                error_over_claim=self.widening,
-                size_mm=1e3 * self._claim_m * self.widening**0.5,
+                error_over_claim=self._cameras.error_scale**2,
+                size_mm=1e3 * self._size_m,
             ),
         )
 
@@ -184,9 +186,9 @@ class RigMonitor:
         ):
             self._checked_ns = now.t_ns
             self._revision = self._cameras.revision
-            given = self._cameras.as_dict()  # of this moment
+            given = self._cameras.as_dict(), self._cameras.error_scale  # of this moment
             self._given_ns = kept[-1].t_ns
-            job = partial(judge_latest, tuple(kept), given, self._markers, self._measured_ns)
+            job = partial(judge_latest, tuple(kept), *given, self._markers, self._measured_ns)
             self._job = _done(job) if self.executor is None else self.executor.submit(job)
         if self._job is None or not self._job.done():
             return ()
@@ -210,10 +212,12 @@ class RigMonitor:
         names = tuple(window.names[k] for k in verdict.cameras)
         self._note_clocks(verdict, measured)
         self._is_contradicted = bool(names)
-        self.widening = verdict.misfit if names else 1.0
-        self._claim_m = _claim_m(window)
+        if verdict.cause is None:
+            self._cameras.scale_errors(next_scale(self._cameras.error_scale, verdict))
+        if names:
+            self._size_m = _claim_m(window) * verdict.misfit**0.5
         self._n_undecided = self._n_undecided + 1 if names and verdict.cause is None else 0
-        self._note_undecided(names if self._n_undecided >= CONFIRMED else ())
+        self._note_undecided(names if self._n_undecided >= CONFIRMED else self._underrated())
         if not names:
             return self._returned(window)
         if verdict.cause != "pose" or names[0] in self.pinned:
@@ -226,6 +230,11 @@ class RigMonitor:
             return changes
         self._use(name)
         return (*changes, placed)
+
+    def _underrated(self) -> tuple[str, ...]:
+        """The cameras, if their errors are larger than the rig states; one that states none is learnt."""
+        stated = any(c.errors or c.covariance for c in self._cameras.as_dict().values())
+        return self._cameras.names if stated and self._cameras.error_scale >= LARGE else ()
 
     def _returned(self, window: Window) -> tuple[ExtrinsicsCorrection, ...]:
         """The excluded cameras that agree with the others, as they were: nothing is at fault in the window."""
@@ -309,7 +318,8 @@ class RigMonitor:
         self.excluded.discard(name)
         self._forget()
         self._walk.forget_poses()
-        self._is_contradicted, self._n_undecided, self.widening = False, 0, 1.0
+        self._is_contradicted, self._n_undecided = False, 0
+        self._cameras.scale_errors(1.0)
         self._clocks.clear()
         self._note_undecided(())
 
@@ -325,11 +335,15 @@ def _done(job: Callable[[], Judgement | None]) -> "Future[Judgement | None]":
 
 
 def judge_latest(
-    keyframes: Sequence[Keyframe], cameras: Mapping[str, Camera], markers: MarkerTable, since_ns: int
+    keyframes: Sequence[Keyframe],
+    cameras: Mapping[str, Camera],
+    error_scale: float,
+    markers: MarkerTable,
+    since_ns: int,
 ) -> Judgement | None:
     """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
     cameras' errors is measured."""
-    array = CameraArray(dict(cameras))
+    array = CameraArray(dict(cameras), error_scale)
     for n in WINDOWS:
         if n <= len(keyframes):
             window, starts = window_of(keyframes[-n:], array, markers)
@@ -347,6 +361,12 @@ def _measure(
     if not is_new.any():
         return None
     return int(times[is_new].mean()), *fit(window.select(is_new), verdict.fit.hypothesis).equations
+
+
+def next_scale(scale: float, verdict: Verdict) -> float:
+    """The factor of the rig's errors after a verdict that blames no camera. It falls slowly: a window shows a part of
+    the arena."""
+    return max(1.0, scale * max(verdict.scale, 1.0 if verdict.cameras else FALL))
 
 
 def _is_stationary(cost: Array) -> bool:

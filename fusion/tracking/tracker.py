@@ -13,7 +13,7 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MatchedObservations
 from fusion.model.robots import Robot
-from fusion.model.states import POSITION, Snapshot
+from fusion.model.states import Snapshot
 from fusion.monitoring.camera_monitors import CameraMonitors
 from fusion.monitoring.frame_consistency import AssignedFrames
 from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
@@ -234,10 +234,7 @@ class Tracker:
 
     def _claim(self) -> None:
         """State the covariances of the robots with the errors of the cameras."""
-        P = self.rig_response.claimed(self.table.states.P, self.robust.added_px2)
-        P[:, :, POSITION] *= self.monitors.rig.widening**0.5
-        P[:, POSITION] *= self.monitors.rig.widening**0.5
-        self.table.claimed = P
+        self.table.claimed = self.rig_response.claimed(self.table.states.P, self.robust.added_px2)
 
     def _misses_bodies(self, tracked: Mask) -> bool:
         """Whether a constellation is missing, whose acquisition can displace a single-marker robot."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -74,6 +75,14 @@ def test_an_implausible_rig_is_not_written(tmp_path):
     with pytest.raises(CalibrationError, match=r"rig\.yaml is not written: camera 'cam0'"):
         save_rig(rig, tmp_path / "rig.yaml")
     assert not list(tmp_path.iterdir())
+
+
+def test_cameras_of_numpys_numbers_are_written_as_others(tmp_path):
+    camera = RIG.cameras["cam0"]
+    same = msgspec.structs.replace(
+        camera, width=np.int64(camera.width), fx=np.float64(camera.fx), distortion=np.array(camera.distortion)
+    )
+    assert dump_rig(Rig(cameras={"cam0": same})) == dump_rig(Rig(cameras={"cam0": camera}))
 
 
 VALUES = st.recursive(

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Rigs whose errors are larger than they state, or that state none: claims grow to what the robots show."""
+
+import numpy as np
+from scipy.stats import chi2
+
+from fusion.rig_graph.hypotheses import Verdict
+from fusion.rig_graph.rig_monitor import next_scale
+from tests.benchmarks.fusion_load import Load
+from tests.fusion.clock_faults import Outcome, fuse, inaccurate, seconds
+
+LOAD = Load(robots=3, cameras=4, hz=30.0, speed_m_s=0.7, crossing=True)
+BEGUN_S = 1.5  # six keyframes, and three judgements
+
+
+def squared(outcome: Outcome) -> np.ndarray:
+    """Squared errors of tracked positions over their claims; chi-square with three degrees where these are true."""
+    rows = zip(outcome.poses, outcome.sigmas, strict=True)
+    return np.array([s**2 for p, s in rows if seconds(p.t_ns) > BEGUN_S and p.state == "tracked"])
+
+
+def test_a_rig_that_states_no_errors_is_learnt():
+    """Errors of one rig are the same in all poses: half of these lie within what nine of ten rigs do not exceed."""
+    outcome = fuse(LOAD, 3.5, {}, rig=inaccurate(LOAD.rig, 1.5))
+    assert outcome.tracked(BEGUN_S) > 0.95
+    assert np.median(squared(outcome)) < chi2.isf(0.1, 3)
+    assert outcome.log == []  # a rig that states nothing is not contradicted
+
+
+def test_a_rig_without_errors_keeps_its_claims():
+    outcome = fuse(LOAD, 2.5, {})
+    sigmas = [
+        np.sqrt(np.diag(p.covariance_matrix)[3:6].mean()) for p in outcome.poses if p.state == "tracked"
+    ]
+    assert np.median(sigmas) < 1.5e-3
+    assert np.median(squared(outcome)) < chi2.isf(0.1, 3)
+
+
+def test_claims_grow_at_once_and_fall_slowly():
+    def verdict(scale: float, *cameras: int) -> Verdict:
+        return Verdict(None, cameras, None, scale=scale)  # pyright: ignore[reportArgumentType]
+
+    assert next_scale(1.0, verdict(16.0, 0, 1)) == 16.0
+    assert 8.0 < next_scale(16.0, verdict(0.1)) < 16.0
+    assert next_scale(16.0, verdict(0.1, 0, 1)) == 16.0  # cameras contradict each other still
+    assert next_scale(1.0, verdict(0.1)) == 1.0  # never below what the rig states
