@@ -69,14 +69,13 @@ class CalibratedFrame:
         cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **timing: Any
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
-        columns = np.zeros((N_ROWS, len(roundels)))
-        columns[UV], columns[COV] = roundels.uv.T, roundels.cov.reshape(-1, 4).T
-        columns[OUTLINE] = np.vstack([roundels.axes_px.T, roundels.angle_rad])
-        columns[XY], scale = undistort(lens, roundels)
-        columns[SCALE] = scale.reshape(4, -1)
+        xy, scale = undistort(lens, roundels)
         # Numbers that files give are no codes.
-        columns[CODE] = np.where(np.isfinite(roundels.id_probability), roundels.id, -1)
-        columns[ROTATION], columns[ROTATION_SIGMA] = roundels.rotation_rad, roundels.rotation_sigma
+        code = np.where(np.isfinite(roundels.id_probability), roundels.id, -1)
+        single = roundels.angle_rad, code, roundels.rotation_rad, roundels.rotation_sigma, np.zeros(len(code))
+        angle, code, rotation, sigma, delay = (column[None] for column in single)
+        outline = roundels.uv.T, roundels.cov.reshape(-1, 4).T, roundels.axes_px.T, angle
+        columns = np.concatenate([*outline, xy, scale.reshape(4, -1), code, rotation, sigma, delay])
         return cls(name, t_ns, roundels, columns, **timing)
 
     def select(self, rows: Index) -> "CalibratedFrame":

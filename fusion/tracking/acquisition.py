@@ -88,6 +88,10 @@ class Acquisition:
             assignments: of the tracked robots.
             histories: of unlabeled markers before this frame set.
         """
+        if not len(missing):
+            markers, crowded = self.search.find(table.markers, 0, detections, assignments)
+            none = table.states.select(missing)
+            return Acquired(missing, none, missing, assignments, markers, {}, crowded)
         named, left = missing[table.coded[missing]], missing[~table.coded[missing]]
         by_name, why_not = self._acquire_named(table, named, detections, assignments)
         assignments = assignments.joined(*(fits.assignments for fits in by_name))

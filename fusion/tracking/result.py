@@ -147,8 +147,9 @@ def robot_poses(
     p, v, omega = _tuples(states.p), _tuples(states.v), _tuples(states.omega)
     wxyz, residual = _tuples(wxyz_from_rotation(states.R)), summary.residual_px.tolist()
     P, markers = table.claimed.astype("<f4").tobytes(), summary.n_markers.tolist()
-    owned, seen_by, age_s = (
+    owned, coded, seen_by, age_s = (
         table.owned.tolist(),
+        table.coded.tolist(),
         summary.robot_cameras.tolist(),
         table.unseen_s(t_ns).tolist(),
     )
@@ -167,7 +168,7 @@ def robot_poses(
             residual_px=residual[k] if markers[k] else None,
             evidence_age_s=age_s[k],
             body_markers=len(table.robots[k].markers),
-            has_code=table.robots[k].is_coded,
+            has_code=coded[k],
             acceleration_density=table.densities[k],
         )
         for k in rows
