@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Recordings of cameras whose clocks jump or drift, and what the tracker makes of them."""
 
+import functools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,6 +32,12 @@ def drift(at_s: float, ppm: float) -> StampError:
     return lambda t_s: max(t_s - at_s, 0.0) * ppm * 1e-6
 
 
+@functools.lru_cache(maxsize=2)
+def detections(load: Load, seconds: float) -> tuple[Detections, ...]:
+    """The messages of a load; its detections are the same whatever the clocks stamp."""
+    return tuple(load.messages(seconds))
+
+
 def arrivals(
     load: Load, seconds: float, faults: Mapping[str, StampError], jitter_s: float | None = JITTER_S
 ) -> list[tuple[int, Detections]]:
@@ -39,7 +46,7 @@ def arrivals(
     Without `jitter_s` each frame arrives at its stamp: a recording that has no arrival times.
     """
     rng, messages = np.random.default_rng(load.seed + 9), []
-    for message in load.messages(seconds):
+    for message in detections(load, seconds):
         fault = faults.get(message.camera)
         error_ns = round(fault((message.t_ns - START_NS) * 1e-9) * 1e9) if fault else 0
         lag_ns = error_ns if jitter_s is None else round((LAG_S + rng.exponential(jitter_s)) * 1e9)
