@@ -15,7 +15,7 @@ from camera_node.protocol.server_connection import ServerConnection
 from fusion.client.arena import Arena as Client
 from tests.fusion.synthetic import WIDE
 from tests.fusion.unknown_robot import WIDE_MOTION, serving_an_unknown_robot
-from tests.waiting import DEADLINE_S, wait_for
+from tests.waiting import DEADLINE_S, Inbox, poll, wait_for
 from tests.web.browser import browsing, showing, value_of
 from web.scene.viewpoint import SAME_M, default_viewpoint
 from web.state.feed import Feed
@@ -23,6 +23,8 @@ from web.state.subscription import Subscription
 from web.tabs.camera_tab import CameraTable
 from web.tabs.marker_picker import MarkerPicker
 from web.view import View
+
+HANDLED_S = 1.0  # after a click has arrived, another handler of it has run
 
 
 @pytest.fixture
@@ -81,16 +83,30 @@ def shows_all_of_the_rig(view: View, positions: list[np.ndarray]) -> bool:
     return bool(view._rig and positions and np.linalg.norm(positions[-1] - chosen) < SAME_M)
 
 
+def selects(point: np.ndarray, arena: tuple[Client, View, MarkerPicker], page: Page, clicks: Inbox) -> bool:
+    """Click on a marker; return whether it is selected, once the click has arrived.
+
+    The server may be too slow to publish the marker for a while, and a second click before the first has arrived would
+    deselect it.
+    """
+    _, view, picker = arena
+    n, sent = len(picker.selected), len(clicks.items)
+    page.mouse.click(*pixel(view, page, point))
+    assert clicks.until(lambda items: len(items) > sent)
+    return poll(lambda: len(picker.selected) > n, deadline_s=HANDLED_S)
+
+
 def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
     """Select its markers, enter its name; then the server tracks it, with x towards the first selected marker."""
     client, view, picker = arena
-    positions = reported_positions(view)
+    positions, clicks = reported_positions(view), Inbox()
+    view.server.scene.on_click()(clicks.put)
     with browsing(view) as page:
         page.get_by_role("button", name="Select markers").click()
         page.get_by_text("click the robot's grey markers").wait_for()
         wait_for(lambda: shows_all_of_the_rig(view, positions))
         for k, point in enumerate(marker_positions()):
-            page.mouse.click(*pixel(view, page, point))
+            wait_for(lambda point=point: selects(point, arena, page, clicks))
             page.get_by_text(f"{k + 1} selected").wait_for()
         assert np.linalg.norm(np.array(picker.selected) - marker_positions(), axis=1).max() < 0.01
         inputs = "[...document.querySelectorAll('input')].find(input => input.value === 'robot')"
