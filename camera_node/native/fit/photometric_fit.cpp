@@ -76,12 +76,11 @@ constexpr double kUnevenGround = 0.04;
 // 3. Levels far from the edges
 constexpr double kMinPlateauMajor = 48;  // pixels: smaller ones gain less than a tone curve costs
 constexpr double kPlateauVariance = 2;   // factor from that of the residuals at the edges
-constexpr double kMaxPlateauError = 3;   // standard deviations
 
 // 4. The print
-constexpr double kMaxPrintError = 3;  // standard deviations
-constexpr double kOtherPrint = 0.1;   // difference of ratios of another print, however uncertain the ratio is
-constexpr double kFirstOrder = 0.5;   // share of an expected curvature's effect that the first order may miss
+constexpr double kMaxChance = 3;  // standard deviations: of the print, and of the levels far from the edges
+constexpr double kOtherPrint = 0.1;  // difference of ratios of another print, however uncertain the ratio is
+constexpr double kFirstOrder = 0.5;  // share of an expected curvature's effect that the first order may miss
 
 /// The fields that a fit contains or tests its residuals for.
 struct FieldEstimate {
@@ -481,7 +480,7 @@ bool PhotometricFitter::condition_on_plateau(Parameter level, const Plateau& pla
     double variance = 1.0 / plateau.count;  // in units of the noise: of the plateau, and of the fit's level
     for (const double x : factor_->halfway(unit)) variance += square(x);
     const double off = plateau.mean - p_[level], n = plateau.count;
-    if (square(off) > square(kMaxPlateauError * noise_) * variance) return false;
+    if (square(off) > square(kMaxChance * noise_) * variance) return false;
     system_.H[level][level] += n;
     g[level] = n * off;
     return true;
@@ -542,7 +541,7 @@ bool PhotometricFitter::condition_on_print(const Print& print) {
     const double seen = print.ratio + effect_of_curvature(tone_.expected)[kRatio];
     const double off = seen - p_[kRatio];
     const double variance = with[kRatio] + square(bent[kRatio]) + square(print.sigma);
-    if (square(off) > square(kMaxPrintError) * variance) return false;
+    if (square(off) > square(kMaxChance) * variance) return false;
     for (int i = 0; i < kPoseCount; ++i) {
         const double both = with[kX + i] + bent[kX + i] * bent[kRatio];
         tone_.deviation[i] = bent[kX + i] / noise_;

@@ -8,15 +8,13 @@ namespace roundel {
 
 namespace {
 
-constexpr double kBrightest = 250;       // of the levels that are certainly not clipped
 constexpr double kMaxLogExponent = 0.9;  // 2.5: steeper ones enlarge what compression leaves
 constexpr int kSteps = 6;                // of Newton's method
 // A print that is only assumed or estimated:
 constexpr double kMaxByCurvature = 0.06;  // smaller roundels may be those of another print
-constexpr double kMinAssumed = -0.3;      // more negative curvatures may be those of another print
 constexpr double kSecondOrder = 0.15;     // error of a measured curvature, over its square
-constexpr double kMinTone = 0.1;          // logarithm of an exponent: smaller ones count as linear
-constexpr double kMaxLinear = 0.1;        // logarithm, up to which a measurement is exact to a hundredth
+// Logarithm of an exponent: smaller ones count as linear, and are measured exactly to a hundredth.
+constexpr double kMinTone = 0.1;
 constexpr double kMinLeft = 0.15;    // of a curvature: less is the error of the print, or learned as a spread
 constexpr double kMinChange = 0.02;  // of the logarithm
 constexpr double kMaxSigma = 0.15;   // of the logarithm, from which it is used
@@ -104,13 +102,13 @@ void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
 /// What the difference between the measured ratio and the print's says about the tone curve. A curve that
 /// brightens the levels between ink and paper by `curvature` s (1 - s) moves both edges into the ring.
 std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFit& fit) const {
-    if (!is_measured(fit) || fit.bright > kBrightest) return std::nullopt;
+    if (!is_measured(fit)) return std::nullopt;
     const Print& print = nearest_print(prints_, fit.ratio);
     const double by_curvature = ratio_by_curvature(fit, print.ratio);
     const double left = (fit.ratio - print.ratio) / by_curvature, curvature = left + fit.curvature;
     const double sigma = std::hypot(fit.ratio_sigma, print.sigma) / by_curvature;
     if (std::abs(curvature) + sigma > kMaxCurvature) return std::nullopt;
-    const bool is_other = left < kMinAssumed && !is_new_;
+    const bool is_other = left < kMinCurvature && !is_new_;
     if (!print.is_exact() && (by_curvature > kMaxByCurvature || is_other)) return std::nullopt;
     const auto exponent = [&](double k) { return log_exponent_of(fit.dark, fit.bright, 0.5 + k / 4); };
     const double here = exponent(curvature);
@@ -243,7 +241,7 @@ bool CameraModel::learn_tone(std::vector<ToneEstimate> measured) {
     knows_tone_ |= sigma_.value() <= kMaxSigma;
     if (sigma_.value() > kMaxSigma || change < enough) return false;
     // The next frame measures the rest: this one was not linear.
-    if (change > kMaxLinear) forget_response();
+    if (change > kMinTone) forget_response();
     set_exponent(std::abs(mean) < kMinTone / 2 ? 0 : std::clamp(mean, -kMaxLogExponent, kMaxLogExponent));
     return true;
 }

@@ -13,7 +13,6 @@ constexpr double kLeast = 2e-5;      // of a gradient and of its rest
 constexpr double kSlopePrior = 2;    // standard deviation of M over that of the gradient
 constexpr int kSteps = 3;            // of the prior's variances
 constexpr double kLeastLevel = 0.3;  // of the light in the middle
-constexpr double kOutlier = 3;       // standard deviations, from which a roundel counts less (Cauchy)
 
 bool shows_light(const RoundelFit* fit) { return fit->shading.variance > 0; }
 
@@ -106,7 +105,8 @@ void LightFalloff::include(const RoundelFit& fit) {
     double weight = 1 / variance;
     if (rest_.is_known()) {
         const auto [x, y] = expected(fit.outer.x, fit.outer.y);
-        weight /= 1 + (square(fit.shading.x - x) + square(fit.shading.y - y)) / (square(kOutlier) * variance);
+        weight /=
+            1 + (square(fit.shading.x - x) + square(fit.shading.y - y)) / (square(kContradiction) * variance);
     }
     regression_.include(by_x, fit.shading.x * level, weight);
     regression_.include(by_y, fit.shading.y * level, weight);

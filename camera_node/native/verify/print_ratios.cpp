@@ -14,7 +14,6 @@ namespace {
 constexpr double kModelSigma = 0.003;    // of the print and of the model, common to all views of a roundel
 constexpr double kSecondOrder = 0.1;     // share of the tone curve's effect that the model leaves out
 constexpr double kCurvaturePrior = 0.6;  // standard deviation; 0.7 is a gamma of 2.2
-constexpr double kMinCurvature = -0.25;  // of the tone curves of cameras
 constexpr double kSameKind = 0.04;       // difference of ratios from the regression
 constexpr size_t kMaxKinds = 8;
 constexpr int kMaxCount = 512;     // measurements that a regression remembers
