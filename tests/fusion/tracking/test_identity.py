@@ -182,11 +182,10 @@ def test_limits_delay_the_acquisition_and_do_not_prevent_it(monkeypatch: pytest.
     monkeypatch.setattr(module, limit, value)
     load = Load(12, 4, 6, 30.0, seed=5, false=60.0 if limit == "MAX_PAIRS" else 1.0)
     tracker = Tracker(load.rig, load.bodies)
-    tracked = [
-        tracker.track(frame_set) and int(tracker.table.tracked.sum()) for frame_set in frame_sets(load, 3.0)
-    ]
-    assert tracked[0] < 12
-    assert tracked[-1] == 12
+    sets = frame_sets(load, 3.0)
+    tracked = (tracker.track(frame_set) and int(tracker.table.tracked.sum()) for frame_set in sets)
+    assert next(tracked) < 12
+    assert 12 in tracked
 
 
 def test_uncertain_distances_identify_nothing_in_bounded_time():
