@@ -173,6 +173,22 @@ def look_up(cells: Array, cell_px: float, uv: Array, axes: Array, angle: Array, 
     uv and axes (N, 2), angle (N,); axes may be NaN. cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`.
     """
 
+def pack_columns(
+    xy: Array,
+    scale: Array,
+    uv: Array,
+    cov: Array,
+    axes: Array,
+    angle: Array,
+    id: NDArray[np.int32],
+    probability: Array,
+    rotation: Array,
+    sigma: Array,
+    /,
+) -> Array:
+    """(19, N) columns of a detection table without delays: `xy` and `scale` as `look_up` returns them, and the columns
+    of `Roundels`."""
+
 def shears(axes: Array, angle: Array, centre: Array, normal: Array, radius: Array, scale: Array, /) -> Array:
     """(2, N) shears of measured ellipses relative to discs with centre and normal (3, N), camera frame."""
 

@@ -11,6 +11,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
+from fusion import _core
 from fusion.model.undistortion import undistort
 
 # Rows of the columns of detections; `DetectionTable` describes them.
@@ -69,13 +70,9 @@ class CalibratedFrame:
         cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **timing: Any
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
-        xy, scale = undistort(lens, roundels)
-        # Numbers that files give are no codes.
-        code = np.where(np.isfinite(roundels.id_probability), roundels.id, -1)
-        single = roundels.angle_rad, code, roundels.rotation_rad, roundels.rotation_sigma, np.zeros(len(code))
-        angle, code, rotation, sigma, delay = (column[None] for column in single)
-        outline = roundels.uv.T, roundels.cov.reshape(-1, 4).T, roundels.axes_px.T, angle
-        columns = np.concatenate([*outline, xy, scale.reshape(4, -1), code, rotation, sigma, delay])
+        r = roundels
+        raw = r.uv, r.cov, r.axes_px, r.angle_rad, r.id, r.id_probability, r.rotation_rad, r.rotation_sigma
+        columns = _core.pack_columns(*undistort(lens, r), *raw)
         return cls(name, t_ns, roundels, columns, **timing)
 
     def select(self, rows: Index) -> "CalibratedFrame":

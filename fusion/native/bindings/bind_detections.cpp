@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
+
 #include "arrays.hpp"
 #include "candidates.hpp"
 #include "inverse_lens.hpp"
@@ -95,6 +97,33 @@ auto look_up_outlines(const In<double, -1, -1, 20>& cells, double cell_px, const
     return both;
 }
 
+/// The columns of a detection table (19, N), without delays: `xy` and `scale` of N roundels as `look_up`
+/// writes them, and their raw columns. A number without a probability comes from a file and is no code.
+auto pack_columns(const Pairs& xy, const Matrices2& scale, const In<double, -1, 2>& uv,
+                  const In<double, -1, 2, 2>& cov, const In<double, -1, 2>& axes, const Numbers& angle,
+                  const In<int32_t, -1>& id, const Numbers& probability, const Numbers& rotation,
+                  const Numbers& sigma) {
+    const size_t n = uv.shape(0);
+    require_equal(n, {xy.shape(1), scale.shape(2), cov.shape(0), axes.shape(0), angle.size(), id.size(),
+                      probability.size(), rotation.size(), sigma.size()});
+    auto [all, to] = make({19, n});
+    const auto transpose = [n, &to = to](const double* from, size_t width) {
+        for (size_t column = 0; column < width; ++column)
+            for (size_t k = 0; k < n; ++k) *to++ = from[k * width + column];
+    };
+    transpose(uv.data(), 2);
+    transpose(cov.data(), 4);
+    transpose(axes.data(), 2);
+    transpose(angle.data(), 1);
+    to = std::copy_n(xy.data(), 2 * n, to);
+    to = std::copy_n(scale.data(), 4 * n, to);
+    for (size_t k = 0; k < n; ++k) *to++ = std::isfinite(probability(k)) ? id(k) : -1;
+    transpose(rotation.data(), 1);
+    transpose(sigma.data(), 1);
+    std::fill_n(to, n, 0.0);
+    return all;
+}
+
 }  // namespace
 
 void bind_detections(nb::module_& m) {
@@ -108,6 +137,7 @@ void bind_detections(nb::module_& m) {
         .def("candidates", &candidates);
     m.def("are_outlines", &are_outlines);
     m.def("look_up", &look_up_outlines);
+    m.def("pack_columns", &pack_columns);
 }
 
 }  // namespace roundel::fusion

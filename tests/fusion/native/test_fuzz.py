@@ -97,6 +97,14 @@ CALLS = {
         (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.zeros(N), np.ones((N, 1, 2))),
     ),
     "look_up": (_core.look_up, (np.zeros((4, 5, 20)), 32.0, np.zeros((N, 2)), np.ones((N, 2)), np.ones(N))),
+    "pack_columns": (
+        _core.pack_columns,
+        (
+            *(np.zeros(shape) for shape in ((2, N), (2, 2, N), (N, 2), (N, 2, 2), (N, 2), N)),
+            np.zeros(N, np.int32),
+            *(np.zeros(N) for _ in range(3)),
+        ),
+    ),
 }
 # Constructors check the indices only where they know what the indices refer to; `log_ratios` only compares cameras.
 UNCHECKED = {"DiscColumns", "DetectionColumns", "log_ratios"}
