@@ -10,14 +10,16 @@ proposed: the epipolar geometry that fits all images at one of them to their noi
 """
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.estimation import GROSS
+from calib.rig.estimation import GROSS, MARGIN
 from calib.rig.rig import Rig
+from calib.wand.body_poses import SIGMA_RAD
 from calib.wand.bundle_adjustment.problem import SLEWED_DRIFT
 from calib.wand.detections import FrameTable, MarkerTrack, Timing, WandDetections, gather, interpolate
 from calib.wand.initial_rig import MAX_SHIFT_S, MIN_MISFIT, SHIFT_SAMPLE, epipolar_misfits, spread_evenly
@@ -229,20 +231,30 @@ def _match(a: _Signal, b: _Signal, max_rate: float) -> _Match | None:
         return None
     grid_s, step_s = max(a.timing.period_s, b.timing.period_s, GRID_S), max(a.step_s, b.step_s)
     width_s = _width(a, list(a.tracks), grid_s, step_s)
-    rate_step = width_s / min(float(np.ptp(a.span)), float(np.ptp(b.span)))
-    count = int(np.ceil(max_rate / rate_step))
-    rates = (rate_step * np.arange(-count, count + 1)).tolist()
+    rate_step = min(MAX_RATE, width_s / min(float(np.ptp(a.span)), float(np.ptp(b.span))))
+    rates = np.linspace(-max_rate, max_rate, 2 * int(np.ceil(max_rate / rate_step)) + 1).tolist()
     proposed = _propose(list(_trials(a, b, labels, (grid_s, step_s, width_s), rates)), 2 * width_s, rate_step)
     geometry = _Epipolar(a, b, labels, width_s, proposed)
     scores = geometry.scores(proposed)
-    best = np.argsort(-scores)[:REFINED]
+    best = [k for k in np.argsort(-scores)[:REFINED].tolist() if scores[k] > 0]
+    if not best:
+        return None
     for k in best:
         proposed[k] = geometry.refine(proposed[k], rate_step)
     scores[best] = geometry.scores(proposed[best])
     first = int(scores.argmax())
-    apart = np.abs((proposed - proposed[first]) @ [1.0, float(np.mean(a.span))]) > 2 * width_s
-    lead = scores[first] - scores.max(initial=0.0, where=apart)
-    return _Match(*proposed[first].tolist()) if lead > EVIDENCE else None
+    found = proposed[first]
+    others = np.abs((proposed - found) @ [1.0, float(np.mean(a.span))]) > 2 * width_s
+    lead = scores[first] - scores.max(initial=0.0, where=others)
+    if lead < EVIDENCE or geometry.misfit(found) > SIGMA_RAD:
+        return None
+    same_rate = geometry.with_same_rate(found)
+    by_rate = geometry.gain(found, same_rate)
+    if by_rate < MARGIN:
+        return _Match(*same_rate.tolist())
+    halves = geometry.halves(found)
+    jumped = sum(half.gain(half.with_same_rate(found), found) for half in halves)
+    return _Match(*found.tolist()) if jumped < MARGIN and by_rate > EVIDENCE else None
 
 
 def _propose(trials: Sequence[tuple[Array, Array, float]], apart_s: float, apart: float) -> Array:
@@ -301,13 +313,39 @@ class _Epipolar:
     def refine(self, match: Array, rate_step: float) -> Array:
         """The best shift and rate (2,) near a trial, by grids that get finer; in the middle of what both saw, shift and
         rate are independent."""
-        middle_s = float(np.mean(self.t_s[self._misfits(match[None])[1][0]]))
+        middle_s = self.middle_s(match)
         x, y = (grid.ravel() for grid in np.meshgrid(*2 * [np.linspace(-1, 1, ACROSS)]))
         for step in 0.5 ** np.arange(REFINEMENTS):
             shift, rate = step * self.width_s * x, 2 * step * rate_step * y
             trials = match + np.column_stack([shift - middle_s * rate, rate])
             match = trials[int(self._misfits(trials)[0].argmin())]
         return match
+
+    def gain(self, match: Array, other: Array) -> float:
+        """By which the score of one shift and rate (2,) exceeds that of another."""
+        return float(self.scores(match[None])[0] - self.scores(other[None])[0])
+
+    def with_same_rate(self, match: Array) -> Array:
+        """The best shift (2,) near a trial of clocks that run alike."""
+        return self.refine(np.array([match @ [1.0, self.middle_s(match)], 0.0]), 0.0)
+
+    def halves(self, match: Array) -> "tuple[_Epipolar, _Epipolar]":
+        """Of what both cameras saw, before and after its middle: a clock that jumps has one rate in both."""
+        known = self._misfits(match[None])[1][0]
+        is_late = self.t_s > self.middle_s(match)
+        parts = copy(self), copy(self)
+        for part, rows in zip(parts, (known & ~is_late, known & is_late), strict=True):
+            part.t_s, part.index, part.xy = self.t_s[rows], self.index[rows], self.xy[rows]
+            part.sample = self.sample[rows]
+        return parts
+
+    def middle_s(self, match: Array) -> float:
+        """The mean time of what both cameras saw."""
+        return float(np.mean(self.t_s[self._misfits(match[None])[1][0]]))
+
+    def misfit(self, match: Array) -> float:
+        """Median distance of the images from the epipolar geometry, image plane."""
+        return float(self._misfits(match[None])[0][0])
 
     def _misfits(self, matches: Array) -> tuple[Array, Mask]:
         """(P,) median distances from the epipolar geometry, and (P, n) which images have a counterpart."""

@@ -41,11 +41,12 @@ def position_error(readout_s: float, uses_rows: bool = True) -> float:
 
 
 def test_errors_are_those_of_a_global_shutter():
-    """Within 1.3 times; without the row times, markers are off by up to half of 30 ms at 2 m/s."""
+    """Within 1.3 times; without the row times, markers are off by up to half of 30 ms at 2 m/s, of which the filter of
+    the clocks takes what all rows have in common."""
     exact = position_error(0.0)
     assert position_error(READOUT_S) < 1.3 * exact
     assert position_error(-READOUT_S) < 1.3 * exact
-    assert position_error(READOUT_S, uses_rows=False) > 3 * exact
+    assert position_error(READOUT_S, uses_rows=False) > 2 * exact
 
 
 @pytest.mark.slow
