@@ -24,15 +24,20 @@ FRAMES, DRIVING_S = 75, 1.5
 
 
 def position_error(readout_s: float, uses_rows: bool = True) -> float:
-    """RMS error, mm, of robots that drive at 2 m/s; no camera may count as moved or as one with a wrong clock."""
+    """RMS error, mm, of robots that drive at 2 m/s; no camera may count as moved or as one with a wrong clock.
+
+    Without row times the cameras are not judged: a rig that is judged counts the displaced markers as its own errors,
+    and robots hold to their predictions.
+    """
     arena = Arena(ROBOTS, MOTIONS, sigma_px=0.1, readout_s=readout_s)
     tracker, synchronizer, squared = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS), []
     for frame in arena.frames(FRAMES):
         synchronizer.add(frame if uses_rows else replace(frame, readout_s=0.0))
         for frame_set in synchronizer.take(frame.t_ns):
             tracker.track(frame_set)
-            moves, clocks = tracker.check_extrinsics(frame_set), tracker.monitors.clocks.health().values()
-            assert not (uses_rows and (moves or any(clock.state != "correct" for clock in clocks)))
+            if uses_rows:
+                assert not tracker.check_extrinsics(frame_set)
+                assert all(clock.state == "correct" for clock in tracker.monitors.clocks.health().values())
             if Arena.seconds(frame_set.t_ns) > DRIVING_S:
                 assert tracker.table.tracked.all()
                 truth = np.array([arena.truth(name, frame_set.t_ns)[1] for name in ROBOTS])
@@ -41,12 +46,11 @@ def position_error(readout_s: float, uses_rows: bool = True) -> float:
 
 
 def test_errors_are_those_of_a_global_shutter():
-    """Within 1.3 times; without the row times, markers are off by up to half of 30 ms at 2 m/s, of which the filter of
-    the clocks takes what all rows have in common."""
+    """Within 1.3 times; without the row times, markers are off by up to half of 30 ms at 2 m/s."""
     exact = position_error(0.0)
     assert position_error(READOUT_S) < 1.3 * exact
     assert position_error(-READOUT_S) < 1.3 * exact
-    assert position_error(READOUT_S, uses_rows=False) > 2 * exact
+    assert position_error(READOUT_S, uses_rows=False) > 3 * exact
 
 
 @pytest.mark.slow
