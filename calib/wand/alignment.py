@@ -33,12 +33,12 @@ MAX_RATE = 0.03  # by which two clocks may differ: 29.97 frames a second read as
 MAX_TRACKS = 8  # markers of which each camera's velocity is used
 FEW = 8.0  # independent samples, which a correlation of two by two coordinates needs
 PROPOSALS = (
-    128  # shifts and rates that are judged: the right one was among the best 100 of each pair that was tried
+    128  # shifts and rates that are judged; of each pair that was tried the right one was among the best 103
 )
-REFINED = 4  # of these are refined
+REFINED = 4  # proposals that are refined
 # By which the logarithm of the likelihood of the right one exceeds that of others: at most 29 in 240 pairs of cameras
 # that saw different motions, at least 40 in 15 s of a light and 75 in 10 s of a wand.
-EVIDENCE = 36.0
+LEAD = 36.0
 FITTED = 9  # parameters: of a fundamental matrix, the shift and the rate
 SLIM = 1e-4  # of the variance, that motion across a line has at the least
 REFINEMENTS, ACROSS = 6, 5  # grids of trial shifts and rates around the best one, each half as wide
@@ -246,7 +246,7 @@ def _match(a: _Signal, b: _Signal, max_rate: float) -> _Match | None:
     found = proposed[first]
     others = np.abs((proposed - found) @ [1.0, float(np.mean(a.span))]) > 2 * width_s
     lead = scores[first] - scores.max(initial=0.0, where=others)
-    if lead < EVIDENCE or geometry.misfit(found) > SIGMA_RAD:
+    if lead < LEAD or geometry.misfit(found) > SIGMA_RAD:
         return None
     same_rate = geometry.with_same_rate(found)
     by_rate = geometry.gain(found, same_rate)
@@ -254,7 +254,7 @@ def _match(a: _Signal, b: _Signal, max_rate: float) -> _Match | None:
         return _Match(*same_rate.tolist())
     halves = geometry.halves(found)
     jumped = sum(half.gain(half.with_same_rate(found), found) for half in halves)
-    return _Match(*found.tolist()) if jumped < MARGIN and by_rate > EVIDENCE else None
+    return _Match(*found.tolist()) if jumped < MARGIN and by_rate > LEAD else None
 
 
 def _propose(trials: Sequence[tuple[Array, Array, float]], apart_s: float, apart: float) -> Array:

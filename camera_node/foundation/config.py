@@ -191,7 +191,6 @@ def _represent_text(dumper: yaml.SafeDumper, data: str) -> yaml.Node:
 _Dumper.add_representer(str, _represent_text)
 _Dumper.add_representer(list, _represent_list)
 _Dumper.add_representer(tuple, _represent_list)
-_Dumper.add_representer(np.float64, lambda dumper, x: dumper.represent_float(float(x)))
 
 
 def read_yaml(path: Path, foreign: bool = False) -> Any:

@@ -38,10 +38,10 @@ BEHIND = 1e6  # squared residual of a disc that is behind its camera
 ADEQUATE = 1.5  # ratio of the mean robust cost to that of noise, up to which a model explains the residuals
 MIN_FOR_PAIRS = 3  # cameras; of fewer, two are no minority
 MAX_SUSPECTS = 4  # cameras that are combined to pairs: those that explain most alone
-SCALES = 2.0 ** np.arange(
-    -4, 4.25, 0.25
-)  # factors of the errors that the calibration states; beyond, in rounds
-ROUNDS = 4  # of them: robust weights rise as errors are explained
+# Factors of the errors that the calibration states, which one linearization compares.
+SCALES = 2.0 ** np.arange(-4, 4.25, 0.25)
+ROUNDS = 4  # linearizations: robust weights rise as errors are explained
+KEPT = 2.0  # a factor below this changes the weights so little that the last linearization holds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +164,7 @@ class Fit:
         rate = _core.CAUCHY**2 / (2 * max(1.0, variance))
         expected = np.exp(rate) * exp1(
             rate
-        )  # of log(1 + square), whose squares have an exponential distribution
+        )  # of log(1 + square): squares of noise are exponentially distributed
         return bool(self._robust().mean() < ADEQUATE * expected)
 
     def _robust(self) -> Array:
@@ -275,7 +275,7 @@ def error_scale(window: Window, none: Fit) -> float:
     for _ in range(ROUNDS):
         factor = _most_likely_scale(window, none)
         scale *= factor
-        if factor < SCALES[-1] ** 0.25:
+        if factor < KEPT:
             break
         window = replace(window, prior=factor**2 * window.prior)
         none = fit(window, none.hypothesis)

@@ -232,7 +232,7 @@ class RigMonitor:
         return (*changes, placed)
 
     def _underrated(self) -> tuple[str, ...]:
-        """The cameras, if their errors are larger than the rig states; one that states none is learnt."""
+        """The cameras, if their errors are larger than the rig states; a rig may state none."""
         stated = any(c.errors or c.covariance for c in self._cameras.as_dict().values())
         return self._cameras.names if stated and self._cameras.error_scale >= LARGE else ()
 
@@ -247,7 +247,7 @@ class RigMonitor:
     def _note_clocks(self, verdict: Verdict, measured: Measured | None) -> None:
         """Add a window that contradicts no pose and no lens to what is known of the clocks.
 
-        A jump of a clock is believed once several verdicts in a row agree on it: a robot's own motion may look like
+        A jump of a clock is accepted once several verdicts in a row agree on it: a robot's own motion may look like
         one.
         """
         self._clocks = [*self._clocks, *verdict.cameras] if verdict.cause == "clock" else []
@@ -364,8 +364,8 @@ def _measure(
 
 
 def next_scale(scale: float, verdict: Verdict) -> float:
-    """The factor of the rig's errors after a verdict that blames no camera. It falls slowly: a window shows a part of
-    the arena."""
+    """The factor of the rig's errors after a verdict that finds no camera at fault. It falls slowly: a window shows a
+    part of the arena."""
     return max(1.0, scale * max(verdict.scale, 1.0 if verdict.cameras else FALL))
 
 
