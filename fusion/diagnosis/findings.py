@@ -21,7 +21,6 @@ from calib.rig.rig import Rig, load_rig
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.messages import CameraStatus
 from fusion.client.arena import Arena
-from fusion.model.robots import load_robots
 from fusion.protocol.arena_health import (
     assess_calibration,
     calibration_problems,
@@ -32,6 +31,8 @@ from fusion.protocol.arena_health import (
 from fusion.protocol.installation import PACKAGES, installation
 from fusion.protocol.pose_messages import FusionStatus
 from fusion.server.arena_config import ArenaConfig
+from fusion.server.storage.active_rig import ActiveRig
+from fusion.server.storage.active_robots import ActiveRobots
 
 CERTIFICATES = ("root_ca_certificate", "listen_certificate", "connect_certificate")
 RENEW_DAYS = 30
@@ -155,18 +156,20 @@ def check_disk(folder: Path) -> Finding:
 
 def check_files(config: ArenaConfig, now: datetime) -> Iterator[Finding]:
     """The rig and the robots that a server with this configuration loads."""
+    given, saved_rig, saved_robots = (
+        Path(file) if file else None for file in (config.rig, config.saved_rig, config.saved_robots)
+    )
     try:
-        robots = load_robots(Path(config.robots))
-        yield Finding("ok", "robots", f"{len(robots)} in {config.robots}")
+        robots = ActiveRobots(Path(config.robots), saved_robots).robots
+        yield Finding("ok", "robots", ", ".join(robots) or "none")
     except RoundelError as error:
         yield Finding("error", "robots", str(error))
-    files = [Path(file) for file in (config.saved_rig, config.rig) if file and Path(file).exists()]
-    if not files:
+    rig = next(ActiveRig(given, saved_rig).saved_rigs(), given)
+    if rig is None:
         yield check_rig(None, now)
         return
-    newest = max(files, key=lambda file: file.stat().st_mtime)
     try:
-        yield check_rig(load_rig(newest), now)
+        yield check_rig(load_rig(rig), now)
     except RoundelError as error:
         yield Finding("error", "calibration", str(error))
 

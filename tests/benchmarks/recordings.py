@@ -74,6 +74,7 @@ def main(gb: tuple[float, ...] = (0.25, 1.0), robots: int = 50, only: tuple[str,
             for command, arguments in chosen.items():
                 peak_mb, elapsed_s, code = run(arguments, path, folder)
                 has_failed |= code != 0 or peak_mb > LIMIT_MB
+                say(f"{command}: {peak_mb:.0f} MB, {elapsed_s:.0f} s, exit code {code}")
                 rows[command] += [
                     f"{peak_mb:.0f}",
                     f"{elapsed_s / seconds:.2f}" if not code else f"exit {code}",

@@ -74,7 +74,7 @@ class ActiveRig:
         Raises:
             ConfigError, CalibrationError: the given file is missing or broken, and there is no saved rig.
         """
-        for path in self._saved_rigs():
+        for path in self.saved_rigs():
             try:
                 rig = load_rig(path)
                 apply(rig)
@@ -267,7 +267,7 @@ class ActiveRig:
         self._remove_folder = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         return Path(folder)
 
-    def _saved_rigs(self) -> Iterator[Path]:
+    def saved_rigs(self) -> Iterator[Path]:
         """The saved rig and those before it, newest first; none if the user changed the given file since then."""
         if self._saved is None or not self._saved.exists() or self._saved == self._given:
             return

@@ -2,6 +2,7 @@
 """`fusion health` and `fusion doctor`: what an operator reads, and the exit codes that a monitoring system reads."""
 
 import json
+import os
 import shutil
 import socket
 from datetime import UTC, datetime, timedelta
@@ -10,14 +11,17 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from calib.rig.rig import Rig
+from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import Detections
 from fusion.client.arena import Arena as Client
-from fusion.diagnosis.findings import check_certificates, check_disk, check_listening, check_rig
-from fusion.model.robots import Robot
+from fusion.diagnosis.findings import check_certificates, check_disk, check_files, check_listening, check_rig
+from fusion.model.robots import Robot, save_robots
 from fusion.protocol.arena_health import assess_calibration, assess_health
+from fusion.protocol.pose_messages import RobotsRequest
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.server_statistics import LATE
+from fusion.server.storage.active_rig import ActiveRig
+from fusion.server.storage.active_robots import ActiveRobots
 from tests.conftest import ROOT, free_port
 from tests.fusion.arena_process import ARENA, cameras_at, saving
 from tests.fusion.serving import ServerProcess
@@ -94,6 +98,30 @@ def test_certificates_that_expire_are_reported(tmp_path: Path, monkeypatch: pyte
         assert [finding.level for finding in findings] == expected, findings
     monkeypatch.chdir(tmp_path)
     assert {finding.level for finding in check_certificates(member, now)} == {"error"}
+
+
+def test_the_files_that_the_server_uses_are_checked_whatever_their_times_are(tmp_path: Path):
+    """Before: the rig that was modified last was judged, which after a copy is any one; saved robots never were."""
+    given, saved = (
+        Rig(cameras=ARENA.cameras, calibration={"grade": grade, "date": NOW.isoformat()}) for grade in "DA"
+    )
+    files = {n: str(tmp_path / f"{n}.yaml") for n in ("rig", "saved_rig", "robots", "saved_robots")}
+    config = msgspec.convert(files, ArenaConfig)
+    save_rig(given, Path(files["rig"]))
+    save_robots(ARENA.robots, Path(files["robots"]))
+    active, robots = (
+        ActiveRig(Path(files["rig"]), Path(files["saved_rig"])),
+        ActiveRobots(Path(files["robots"]), Path(files["saved_robots"])),
+    )
+    active.save(saved, 0)
+    robots.change(RobotsRequest(rename={next(iter(ARENA.robots)): "rover"}))
+    for newest in files.values():
+        for file in files.values():
+            os.utime(file, (0, 0))
+        os.utime(newest)
+        said = {finding.subject: finding for finding in check_files(config, NOW)}
+        assert said["robots"].state.startswith("rover")
+        assert said["calibration"].level == "ok", newest
 
 
 @pytest.mark.parametrize(
