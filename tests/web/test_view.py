@@ -6,27 +6,31 @@ import os
 import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import isclose
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import viser
 from playwright.sync_api import Page
+from websockets.sync.client import connect
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.geometry.pose import Pose, look_at, rotation_from_wxyz
 from camera_node.protocol.messages import encode
-from tests.waiting import repeating, wait_for
+from tests.waiting import DEADLINE_S, repeating, wait_for
 from tests.web.arena import LiveArena, four_cameras
-from tests.web.browser import browsing, loopback
+from tests.web.browser import browsing, drawing, loopback
 from web.errors import WebError
 from web.scene.viewpoint import FIELD_OF_VIEW, MARGIN, USUAL_ROOM, default_viewpoint
-from web.state.feed import DemoProgress, Feed, progress_key
+from web.state.feed import ArenaState, DemoProgress, Feed, progress_key
 from web.tabs.camera_tab import decode_jpeg
-from web.view import View, check_port
+from web.view import PERIOD_S, View, check_port
 
 
 @pytest.fixture
@@ -232,3 +236,34 @@ def test_the_default_viewpoint_shows_the_whole_rig(rig: Rig | None, aspect: floa
 @pytest.mark.parametrize("data", [None, b"", b"not an image", bytes(100)])
 def test_bytes_that_are_not_a_jpeg(data: bytes | None):
     assert decode_jpeg(data) is None
+
+
+class SlowSection:
+    """Counts the drawings in a text of the page; each takes three times as long as it may."""
+
+    def __init__(self, view: View) -> None:
+        self.count = 0
+        self._text = view.server.gui.add_markdown("")
+
+    def update(self, state: ArenaState) -> None:
+        self.count += 1
+        self._text.content = f"drawing {self.count}."
+        begun = time.monotonic()
+        while time.monotonic() - begun < 3 * PERIOD_S:
+            pass
+
+
+def test_browsers_follow_where_drawings_take_longer_than_their_period():
+    """As on a loaded machine: with drawings that followed each other at once, browsers received one in twenty."""
+    view = View(Feed("test"), loopback())
+    section = SlowSection(view)
+    view.add(section, interval=1)
+    protocol: Any = [f"viser-v{viser.__version__}"]
+    received: set[bytes] = set()
+    with (
+        drawing(view),
+        connect(f"ws://127.0.0.1:{view.access.port}", subprotocols=protocol, max_size=None) as browser,
+    ):
+        while section.count < 12:
+            received |= set(re.findall(rb"drawing \d+\.", bytes(browser.recv(DEADLINE_S, decode=False))))
+    assert len(received) > section.count / 2
