@@ -164,18 +164,9 @@ class MarkerCloud:
         are none.
         """
 
-def are_outlines(axes: Array, angle: Array, low: float, high: float, /) -> NDArray[np.bool_]:
-    """(N,) whether full axes (N, 2) and directions (N,) are those of outlines with axes from `low` to `high` px."""
-
-def look_up(cells: Array, cell_px: float, uv: Array, axes: Array, angle: Array, /) -> Array:
-    """(6, N) centres of undistorted ellipses, and Jacobians (2, 2) of pixels by undistorted coordinates.
-
-    uv and axes (N, 2), angle (N,); axes may be NaN. cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`.
-    """
-
-def pack_columns(
-    xy: Array,
-    scale: Array,
+def measure(
+    cells: Array,
+    cell_px: float,
     uv: Array,
     cov: Array,
     axes: Array,
@@ -186,8 +177,8 @@ def pack_columns(
     sigma: Array,
     /,
 ) -> Array:
-    """(19, N) columns of a detection table without delays: `xy` and `scale` as `look_up` returns them, and the columns
-    of `Roundels`."""
+    """(19, N) columns of a `DetectionTable` without delays, from those of `Roundels`: NaN where outlines are impossible
+    or cells are empty. cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`."""
 
 def shears(axes: Array, angle: Array, centre: Array, normal: Array, radius: Array, scale: Array, /) -> Array:
     """(2, N) shears of measured ellipses relative to discs with centre and normal (3, N), camera frame."""

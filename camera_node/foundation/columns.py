@@ -23,13 +23,13 @@ class Columns:
     SHARED: ClassVar[frozenset[str]] = frozenset()
 
     def __len__(self) -> int:
-        first = next(getattr(self, name) for name in _names(type(self)) if name not in self.SHARED)
+        first = getattr(self, _first_name(type(self)))
         return len(first) if isinstance(first, Columns) else first.shape[self.ROW_AXIS]
 
     def select(self, rows: NDArray) -> Self:
         """The rows of a mask or an index array, contiguous in memory."""
-        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
-        return type(self)(*(self._selected(name, rows) for name in _names(type(self))))
+        rows = rows.nonzero()[0] if rows.dtype == bool else rows
+        return type(self)(*[self._selected(name, rows) for name in _names(type(self))])
 
     def joined(self, *others: Self) -> Self:
         """These rows, then those of the others."""
@@ -49,6 +49,11 @@ class Columns:
         if isinstance(first, Columns):
             return first.joined(*others)
         return np.concatenate([first, *others], self.ROW_AXIS)
+
+
+@cache
+def _first_name(kind: type[Columns]) -> str:
+    return next(name for name in _names(kind) if name not in kind.SHARED)
 
 
 @cache

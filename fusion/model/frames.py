@@ -11,12 +11,8 @@ from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
-from fusion import _core
-from fusion.model.undistortion import undistort
+from fusion.model.undistortion import measure
 
-# Rows of the columns of detections; `DetectionTable` describes them.
-UV, COV, OUTLINE, XY, SCALE = slice(2), slice(2, 6), slice(6, 9), slice(9, 11), slice(11, 15)
-CODE, ROTATION, ROTATION_SIGMA, DELAY, N_ROWS = *range(15, 19), 19
 MAX_CLOCK_ERROR_S = 0.1  # a stamp with a larger bound has this one; NaN is an unknown bound
 
 
@@ -47,14 +43,12 @@ class CalibratedFrame:
     readout_s: float = 0.0
 
     @classmethod
-    def of(
-        cls, message: Detections, camera: Camera, received_ns: int = 0, roundels: Roundels | None = None
-    ) -> "CalibratedFrame":
-        """The frame of a message from a calibrated camera; `roundels` in place of those of the message."""
+    def of(cls, message: Detections, camera: Camera, received_ns: int = 0) -> "CalibratedFrame":
+        """The frame of a message from a calibrated camera."""
         return cls.measure(
             message.camera,
             camera.capture_ns(message.t_ns, message.sent_ns),
-            message.unpack() if roundels is None else roundels,
+            message.unpack(),
             camera,
             stamp_ns=message.t_ns,
             sent_ns=message.sent_ns,
@@ -70,10 +64,7 @@ class CalibratedFrame:
         cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **timing: Any
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
-        r = roundels
-        raw = r.uv, r.cov, r.axes_px, r.angle_rad, r.id, r.id_probability, r.rotation_rad, r.rotation_sigma
-        columns = _core.pack_columns(*undistort(lens, r), *raw)
-        return cls(name, t_ns, roundels, columns, **timing)
+        return cls(name, t_ns, roundels, measure(lens, roundels), **timing)
 
     def select(self, rows: Index) -> "CalibratedFrame":
         """The frame with some of its roundels."""
@@ -83,8 +74,7 @@ class CalibratedFrame:
         """The frame by another calibration of its camera."""
         stamp_ns = self.stamp_ns or self.t_ns
         before_ns, after_ns = (camera.capture_ns(stamp_ns, self.sent_ns) for camera in (old, new))
-        columns = self.measure(self.camera, 0, self.roundels, new).columns
-        return replace(self, t_ns=self.t_ns + after_ns - before_ns, columns=columns)
+        return replace(self, t_ns=self.t_ns + after_ns - before_ns, columns=measure(new, self.roundels))
 
     def delays(self, lens: Lens) -> Array:
         """(N,) times from `t_ns` to the capture of each roundel's row, seconds."""

@@ -21,7 +21,10 @@ from camera_node.geometry.outline import half_axes_of
 from fusion import _core
 from fusion._core import SLACK_PX
 from fusion.model.corrections import with_errors_of
-from fusion.model.frames import (
+from fusion.model.frames import FrameSet
+from fusion.model.robots import Robot
+from fusion.model.states import States
+from fusion.model.undistortion import (
     CODE,
     COV,
     DELAY,
@@ -32,11 +35,8 @@ from fusion.model.frames import (
     SCALE,
     UV,
     XY,
-    FrameSet,
+    table_of,
 )
-from fusion.model.robots import Robot
-from fusion.model.states import States
-from fusion.model.undistortion import table_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,9 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.outline import RawEllipses, centre_shifts, half_axes_of
+from camera_node.geometry.outline import centre_shifts, half_axes_of
 from fusion import _core
 
 CELL_PX, FINE_CELL_PX = 32, 16
@@ -38,29 +39,36 @@ NODES = np.cos(np.pi * (np.arange(4) + 0.5) / 4)  # Chebyshev nodes of the four 
 CHECKED = np.array([-1.0, 0.0, 1.0])  # where a cubic fitted at the nodes has its largest errors
 
 
-def undistort(lens: Lens, ellipses: RawEllipses) -> tuple[Array, Array]:
-    """Undistort N detected ellipses.
+# Rows of the columns of detections; `DetectionTable` describes them.
+UV, COV, OUTLINE, XY, SCALE = slice(2), slice(2, 6), slice(6, 9), slice(9, 11), slice(11, 15)
+CODE, ROTATION, ROTATION_SIGMA, DELAY, N_ROWS = *range(15, 19), 19
+
+
+def measure(lens: Lens, roundels: Roundels) -> Array:
+    """Undistort N detected roundels.
 
     Args:
         lens: lens model of the camera.
-        ellipses: in raw pixels.
+        roundels: in raw pixels.
 
     Returns:
-        xy: (2, N) centres of the undistorted ellipses (`camera_node.geometry.outline`), within `TOLERANCE_PX` of those
-            by `Lens.normalise`; the undistorted centres where axes are unknown, NaN where the lens has no inverse.
-        scale: (2, 2, N) Jacobians of raw pixels with respect to undistorted coordinates at the detected centres.
+        (19, N) columns of a `DetectionTable`, without the errors of cameras and without delays. Centres of the
+        undistorted ellipses (`camera_node.geometry.outline`) are within `TOLERANCE_PX` of those by `Lens.normalise`;
+        they are the undistorted centres where axes are unknown or impossible, and NaN where the lens has no inverse.
     """
-    xy, scale = table_of(lens).look_up(ellipses)
-    left = np.flatnonzero(np.isnan(xy[0]))
-    if len(left):
-        half_axes = half_axes_of(ellipses.axes_px[left], ellipses.angle_rad[left])
-        xy[:, left], scale[..., left] = undistort_exactly(lens, ellipses.uv[left], half_axes)
-    return xy, scale
+    columns = table_of(lens).measure(roundels)
+    if np.isnan(columns[XY.start]).any():
+        left = np.flatnonzero(np.isnan(columns[XY.start]))
+        uv, outlines = columns[UV, left].T, columns[OUTLINE, left]
+        xy, scale = undistort_exactly(lens, uv, half_axes_of(outlines[:2].T, outlines[2]))
+        columns[XY, left], columns[SCALE, left] = xy, scale.reshape(4, -1)
+    return columns
 
 
 @np.errstate(all="ignore")  # as in `centre_shifts`
 def undistort_exactly(lens: Lens, uv: Array, half_axes: Array) -> tuple[Array, Array]:
-    """As `undistort`, from the lens model, for ellipses with centres (N, 2) and half axes (N, 2, 2), pixels."""
+    """Centres (2, N) and Jacobians (2, 2, N) of pixels as of `measure`, from the lens model, for ellipses with centres
+    (N, 2) and half axes (N, 2, 2), pixels."""
     xy, scale = _undistort_points(lens, uv)
     known = np.flatnonzero(np.isfinite(xy[0]))
     if len(known):
@@ -82,7 +90,7 @@ def _table_of(lens: Lens) -> "UndistortionTable":
 
 
 def prepare_lenses(lenses: Iterable[Lens]) -> None:
-    """Make the tables of lenses, so that `undistort` finds them; callable on any thread."""
+    """Make the tables of lenses, so that `measure` finds them; callable on any thread."""
     for lens in lenses:
         table_of(lens)
 
@@ -105,11 +113,10 @@ class UndistortionTable:
         cells = fitted.reshape(*fitted.shape[:2], 2 * len(POWERS))
         self.coefficients = np.pad(cells, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
 
-    def look_up(self, ellipses: RawEllipses) -> tuple[Array, Array]:
-        """See `undistort`; NaN in empty cells."""
-        columns = ellipses.uv, ellipses.axes_px, ellipses.angle_rad
-        both = _core.look_up(self.coefficients, self.cell_px, *map(np.ascontiguousarray, columns))
-        return both[:2], both[2:].reshape(2, 2, -1)
+    def measure(self, r: Roundels) -> Array:
+        """See `measure`; coordinates are NaN in empty cells."""
+        raw = r.uv, r.cov, r.axes_px, r.angle_rad, r.id, r.id_probability, r.rotation_rad, r.rotation_sigma
+        return _core.measure(self.coefficients, self.cell_px, *raw)
 
 
 def _monomials(st: Array) -> Array:

@@ -89,7 +89,8 @@ class CameraClocks:
 
     def uncertain(self, speed_m_s: float) -> set[str]:
         """Cameras whose time is not known well enough to locate robots at this speed, while two others are."""
-        found = {name for name, clock in self._clocks.items() if clock.known_s * speed_m_s > MAX_MOTION_M}
+        corrected = ((name, clock) for name, clock in self._clocks.items() if clock.sigma_s)
+        found = {name for name, clock in corrected if clock.known_s * speed_m_s > MAX_MOTION_M}
         return found if len(self._clocks) > len(found) + 1 else set()
 
     def inherit(self, old: "CameraClocks") -> None:

@@ -25,7 +25,7 @@ class CameraMonitors:
     """
 
     def __init__(self, cameras: CameraArray, markers: MarkerTable) -> None:
-        self._cameras, self._speed_m_s = cameras, 0.0
+        self._cameras, self._speed_m_s, self._speed_ns = cameras, 0.0, 0
         self.clocks = CameraClocks(cameras.names)
         self.frozen = FrozenImages(cameras, markers)
         self.consistency = FrameConsistency(cameras, markers)
@@ -51,7 +51,8 @@ class CameraMonitors:
         """
         if sigma_s := self.clocks.observe(frame):
             self.rig.jump(frame.camera, sigma_s)
-        if now is not None and now.tracked.any():
+        if now is not None and now.t_ns != self._speed_ns and now.tracked.any():
+            self._speed_ns = now.t_ns
             self._speed_m_s = float(np.linalg.norm(now.states.v[now.tracked], axis=1).max())
         admitted = self.clocks.admit(frame)
         return None if admitted is None or self.frozen.is_frozen(admitted, now) else admitted

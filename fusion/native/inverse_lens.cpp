@@ -69,9 +69,9 @@ const double* InverseLens::cell(double column, double row) const {
 
 void look_up(const InverseLens& lens, const Outlines& seen, double* xy, double* scale) {
     const double per_px = 2 / lens.cell_px;
-    const size_t n = seen.count;
+    const size_t n = seen.uv.n;
     for (size_t k = 0; k < n; ++k) {
-        const double u = (seen.uv[2 * k] + 0.5) / lens.cell_px, v = (seen.uv[2 * k + 1] + 0.5) / lens.cell_px;
+        const double u = (seen.uv.at(0, k) + 0.5) / lens.cell_px, v = (seen.uv.at(1, k) + 0.5) / lens.cell_px;
         const double column = std::floor(u), row = std::floor(v);
         const double s = 2 * (u - column) - 1, t = 2 * (v - row) - 1;
         const double* cell = lens.cell(column, row);
@@ -79,7 +79,7 @@ void look_up(const InverseLens& lens, const Outlines& seen, double* xy, double* 
         xy[k] = x.value;
         xy[n + k] = y.value;
         const double c = per_px * std::cos(seen.angle[k]), d = per_px * std::sin(seen.angle[k]);
-        const double a = seen.axes[2 * k] / 2, b = seen.axes[2 * k + 1] / 2;
+        const double a = seen.axes.at(0, k) / 2, b = seen.axes.at(1, k) / 2;
         const LensAt at{x, y, Curvature::of(cell, s, t), Curvature::of(cell + 10, s, t)};
         at.move_centre({c * a, d * a}, {-d * b, c * b}, xy[k], xy[n + k]);
         const double per_det = 1 / (per_px * (x.by_s * y.by_t - x.by_t * y.by_s));

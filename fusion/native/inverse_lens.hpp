@@ -17,11 +17,11 @@ struct InverseLens {
     const double* cell(double column, double row) const;
 };
 
-/// Detected ellipses, raw pixels: centres (pairs u, v), full axes (pairs) and directions of the first axis;
-/// NaN where the axes are unknown.
+/// Detected ellipses, raw pixels: centres, full axes and directions of the first axis; NaN where the axes are
+/// unknown.
 struct Outlines {
-    const double *uv, *axes, *angle;
-    size_t count;
+    Columns<2> uv, axes;
+    const double* angle;
 };
 
 /// Undistorts N ellipses: writes 2 x N centres of the undistorted ellipses (the undistorted centres where the

@@ -8,16 +8,14 @@ bounded for any input.
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
 from camera_node.protocol.publishers import Publishers
-from fusion import _core
 from fusion.model.frames import CalibratedFrame
 from fusion.server.server_statistics import ServerStatistics
 
@@ -31,7 +29,6 @@ HISTORY = 64  # frames of a camera
 # Of sequence numbers in the history, for two publishers that do not say who they are: a restarted node makes one.
 MIN_STEPS_BACK = 4
 ANOTHER_NODE = "frames of another node under its name"
-AXES_PX = 0.5, 1e5  # plausible axes of an outline
 Refusal = Literal["unknown camera", "wrong image size"]
 
 
@@ -46,12 +43,11 @@ def admit(
         received_ns: when it arrived; 0 offline.
 
     Returns:
-        the frame with the parts that are used: plausible outlines, and at most `MAX_DETECTIONS` detections.
+        the frame with at most `MAX_DETECTIONS` detections.
     """
     if (refused := refusal(message, cameras)) is not None:
         return refused
-    roundels = _with_plausible_outlines(message.unpack())
-    frame = CalibratedFrame.of(message, cameras[message.camera], received_ns, roundels)
+    frame = CalibratedFrame.of(message, cameras[message.camera], received_ns)
     return _with_strongest(frame) if len(frame.roundels) > MAX_DETECTIONS else frame
 
 
@@ -161,15 +157,6 @@ class Ingest:
         has_two = self._publishers.is_contested(message.camera) or sum(history.steps_back) >= MIN_STEPS_BACK
         self._statistics.note_publishers(message.camera, has_two)
         return True
-
-
-def _with_plausible_outlines(roundels: Roundels) -> Roundels:
-    """The roundels, with NaN for the axes and the angle of each impossible outline."""
-    good = _core.are_outlines(roundels.axes_px, roundels.angle_rad, *AXES_PX)
-    if good.all():
-        return roundels
-    axes_px = np.where(good[:, None], roundels.axes_px, np.nan)
-    return replace(roundels, axes_px=axes_px, angle_rad=np.where(good, roundels.angle_rad, np.nan))
 
 
 def _with_strongest(frame: CalibratedFrame) -> CalibratedFrame:

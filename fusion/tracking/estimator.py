@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Mask
 from fusion import _core
-from fusion.model.frames import COV, OUTLINE
 from fusion.model.observations import CameraArray, MatchedObservations
 from fusion.model.states import States, Transition, predict, reset_unobservable
+from fusion.model.undistortion import COV, OUTLINE
 from fusion.tracking.gating import AXIS_SIGMA_PX
 from fusion.tracking.headings import linearize_headings, read_headings
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.frames import COV
 from fusion.model.observations import (
     Assignments,
     DetectionTable,
@@ -28,6 +27,7 @@ from fusion.model.observations import (
     mean_by_body,
 )
 from fusion.model.states import POSITION, States
+from fusion.model.undistortion import COV
 from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, costs_of
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2

@@ -71,52 +71,45 @@ auto candidates(const ExpectedMarkers& markers, const FramePoses& poses, const D
     return std::make_tuple(pairs, costs);
 }
 
-/// (N,) whether full axes (N, 2) and the direction of the first one are those of an outline with axes in a
-/// range.
-auto are_outlines(const In<double, -1, 2>& axes, const Numbers& angle, double low, double high) {
-    constexpr double kRounding = 1.001;  // of the axes of a circle, as floats of another program
-    const size_t n = angle.size();
-    require_equal(n, {axes.shape(0)});
-    auto [all, to] = make<bool>({n});
+constexpr double kMinAxis = 0.5, kMaxAxis = 1e5;  // of a plausible outline, pixels
+constexpr double kRounding = 1.001;               // of the axes of a circle, as floats of another program
+
+/// Writes NaN in place of the full axes (2 x N) and the directions (N) of impossible outlines.
+void forget_impossible(double* outlines, size_t n) {
     for (size_t k = 0; k < n; ++k) {
-        const double major = axes(k, 0), minor = axes(k, 1);
-        to[k] = minor > low && minor <= kRounding * major && major < high && std::isfinite(angle(k));
+        const double major = outlines[k], minor = outlines[n + k];
+        if (minor > kMinAxis && minor <= kRounding * major && major < kMaxAxis &&
+            std::isfinite(outlines[2 * n + k]))
+            continue;
+        for (size_t row = 0; row < 3; ++row) outlines[row * n + k] = std::numeric_limits<double>::quiet_NaN();
     }
-    return all;
 }
 
-auto look_up_outlines(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv,
-                      const In<double, -1, 2>& axes, const Numbers& angle) {
+/// The columns of a detection table (19, N), without delays, of N roundels: impossible outlines are NaN. A
+/// number without a probability comes from a file and is no code.
+auto measure(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv,
+             const In<double, -1, 2, 2>& cov, const In<double, -1, 2>& axes, const Numbers& angle,
+             const In<int32_t, -1>& id, const Numbers& probability, const Numbers& rotation,
+             const Numbers& sigma) {
     if (cells.shape(0) < 3 || cells.shape(1) < 3) throw nb::value_error("a table without cells");
     const InverseLens lens{cells.data(), int64_t(cells.shape(1)) - 2, int64_t(cells.shape(0)) - 2, cell_px};
     const size_t n = uv.shape(0);
-    require_equal(n, {axes.shape(0), angle.size()});
-    const Outlines seen{uv.data(), axes.data(), angle.data(), n};
-    auto [both, to] = make({6, n});
-    unlocked([&, xy = to, scale = to + 2 * n] { look_up(lens, seen, xy, scale); });
-    return both;
-}
-
-/// The columns of a detection table (19, N), without delays: `xy` and `scale` of N roundels as `look_up`
-/// writes them, and their raw columns. A number without a probability comes from a file and is no code.
-auto pack_columns(const Pairs& xy, const Matrices2& scale, const In<double, -1, 2>& uv,
-                  const In<double, -1, 2, 2>& cov, const In<double, -1, 2>& axes, const Numbers& angle,
-                  const In<int32_t, -1>& id, const Numbers& probability, const Numbers& rotation,
-                  const Numbers& sigma) {
-    const size_t n = uv.shape(0);
-    require_equal(n, {xy.shape(1), scale.shape(2), cov.shape(0), axes.shape(0), angle.size(), id.size(),
-                      probability.size(), rotation.size(), sigma.size()});
+    require_equal(n, {cov.shape(0), axes.shape(0), angle.size(), id.size(), probability.size(),
+                      rotation.size(), sigma.size()});
     auto [all, to] = make({19, n});
     const auto transpose = [n, &to = to](const double* from, size_t width) {
         for (size_t column = 0; column < width; ++column)
             for (size_t k = 0; k < n; ++k) *to++ = from[k * width + column];
     };
+    const Columns<2> centres{to, n};
     transpose(uv.data(), 2);
     transpose(cov.data(), 4);
+    double* const outlines = to;
     transpose(axes.data(), 2);
     transpose(angle.data(), 1);
-    to = std::copy_n(xy.data(), 2 * n, to);
-    to = std::copy_n(scale.data(), 4 * n, to);
+    forget_impossible(outlines, n);
+    look_up(lens, {centres, {outlines, n}, outlines + 2 * n}, to, to + 2 * n);
+    to += 6 * n;
     for (size_t k = 0; k < n; ++k) *to++ = std::isfinite(probability(k)) ? id(k) : -1;
     transpose(rotation.data(), 1);
     transpose(sigma.data(), 1);
@@ -135,9 +128,7 @@ void bind_detections(nb::module_& m) {
         .def("__init__", &make_expected)
         .def("covariances", &covariances)
         .def("candidates", &candidates);
-    m.def("are_outlines", &are_outlines);
-    m.def("look_up", &look_up_outlines);
-    m.def("pack_columns", &pack_columns);
+    m.def("measure", &measure);
 }
 
 }  // namespace roundel::fusion

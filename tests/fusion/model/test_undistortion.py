@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The table of an inverse lens model compared with the lens model."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from camera_node.detection.roundels import Roundels
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import half_axes_of
 from fusion.model.undistortion import (
     MAX_CELLS,
+    SCALE,
     TOLERANCE_PX,
     TOLERANCE_SCALE,
+    XY,
     UndistortionTable,
+    measure,
     table_of,
-    undistort,
     undistort_exactly,
 )
 from tests.calib.synthetic import fit_ellipses
@@ -32,18 +35,15 @@ LENSES = {
 }
 
 
-@dataclass(frozen=True)
-class Ellipses:
-    """Ellipses in raw pixels: centres (N, 2), full axes (N, 2) and directions (N,)."""
-
-    uv: np.ndarray
-    axes_px: np.ndarray
-    angle_rad: np.ndarray
-
-
-def points(uv: np.ndarray) -> Ellipses:
+def points(uv: np.ndarray) -> Roundels:
     """Centres (N, 2) of unknown size."""
-    return Ellipses(uv, np.full((len(uv), 2), np.nan), np.full(len(uv), np.nan))
+    return Roundels.from_points(uv, 1.0)
+
+
+def undistort(lens: Lens, ellipses: Roundels) -> tuple[np.ndarray, np.ndarray]:
+    """Undistorted centres (2, N), and Jacobians (2, 2, N) of pixels."""
+    columns = measure(lens, ellipses)
+    return columns[XY], columns[SCALE].reshape(2, 2, -1)
 
 
 def pixels(lens: Lens, n: int = 4000) -> np.ndarray:
@@ -74,7 +74,8 @@ def test_centres_are_those_of_undistorted_ellipses(name):
     lens = LENSES[name]
     uv = np.random.default_rng(4).uniform([80, 80], [lens.width - 80, lens.height - 80], (900, 2))
     uv = uv[np.linalg.norm(lens.normalise(uv), axis=1) < np.tan(np.radians(52))][:300]
-    seen = Ellipses(uv, np.tile([24.0, 16.0], (300, 1)), np.random.default_rng(5).uniform(-1.5, 1.5, 300))
+    angle = np.random.default_rng(5).uniform(-1.5, 1.5, 300)
+    seen = replace(points(uv), axes_px=np.tile([24.0, 16.0], (300, 1)), angle_rad=angle)
     turn = 2 * np.pi * np.arange(32) / 32
     around = np.stack([np.cos(turn), np.sin(turn)])
     outline = uv[:, None] + (half_axes_of(seen.axes_px, seen.angle_rad) @ around).mT
@@ -98,7 +99,7 @@ def test_the_table_covers_the_image_of_a_usual_lens(name):
     lens = LENSES[name]
     inside = pixels(lens)
     inside = inside[((inside > -0.5) & (inside < [lens.width - 0.5, lens.height - 0.5])).all(1)]
-    assert np.isfinite(table_of(lens).look_up(points(inside))[0][0]).mean() > 0.98
+    assert np.isfinite(table_of(lens).measure(points(inside))[XY.start]).mean() > 0.98
 
 
 @settings(max_examples=30)
@@ -108,7 +109,7 @@ def test_any_ellipse_is_accepted(ellipses):
     of what it is."""
     lens, columns = LENSES["usual"], np.array(ellipses).reshape(-1, 5)
     uv, axes, angle = columns[:, :2], columns[:, 2:4], columns[:, 4]
-    xy, scale = undistort(lens, Ellipses(uv, axes, angle))
+    xy, scale = undistort(lens, replace(points(uv), axes_px=axes, angle_rad=angle))
     assert xy.shape == (2, len(uv))
     assert (np.isfinite(xy[0]) == np.isfinite(undistort(lens, points(uv))[0][0])).all()
     assert (np.isfinite(scale).all((0, 1)) == np.isfinite(xy[0])).all()
@@ -122,7 +123,7 @@ def test_the_largest_image_has_a_small_table():
     table = UndistortionTable(lens)
     assert table.coefficients.nbytes < 8 * 20 * (2 * MAX_CELLS)
     uv = np.random.default_rng(0).uniform(0, 32768, (200, 2))
-    xy, _ = table.look_up(points(uv))
+    xy = table.measure(points(uv))[XY]
     known = np.isfinite(xy[0])
     assert known.mean() > 0.9
     np.testing.assert_allclose(xy[:, known].T, lens.normalise(uv[known]), atol=2 * TOLERANCE_PX / 3e4)

@@ -86,9 +86,12 @@ bool estimate(Random& random, double wild) {
                   axes = random.numbers(2 * n, 20, wild), one = random.numbers(n, 1, wild);
     const std::unique_ptr<bool[]> single(new bool[bodies]());
     std::vector<Equations> rows(n), outlines(n);
-    linearize(poses, CentreObservations{discs, {xy.data(), n}, {four.data(), n}, single.get()}, rows.data());
-    linearize(poses, OutlineObservations{discs, {axes.data(), n}, one.data(), {four.data(), n}, one.data()},
-              outlines.data());
+    const CentreObservations centres{discs, {xy.data(), n}, {four.data(), n}, single.get()};
+    const OutlineObservations seen{discs, {axes.data(), n}, one.data(), {four.data(), n}, one.data()};
+    for (size_t k = 0; k < n; ++k) {
+        rows[k] = linearize(poses, centres, k);
+        outlines[k] = linearize(poses, seen, k);
+    }
     std::vector<ErrorMatrix> H(bodies);
     std::vector<ErrorVector> g(bodies);
     for (size_t b = 0; b < bodies; ++b) {
@@ -171,7 +174,7 @@ bool undistort(Random& random, double wild) {
     const Numbers uv = random.numbers(2 * n, 100, wild), axes = random.numbers(2 * n, 30, wild),
                   angle = random.numbers(n, 1, wild);
     Numbers xy(2 * n), scale(4 * n);
-    const Outlines seen{uv.data(), axes.data(), angle.data(), n};
+    const Outlines seen{{uv.data(), n}, {axes.data(), n}, angle.data()};
     look_up({cells.data(), int64_t(columns), int64_t(rows), 32}, seen, xy.data(), scale.data());
     return true;
 }

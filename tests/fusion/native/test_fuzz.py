@@ -3,6 +3,7 @@
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -96,11 +97,10 @@ CALLS = {
         ),
         (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.zeros(N), np.ones((N, 1, 2))),
     ),
-    "look_up": (_core.look_up, (np.zeros((4, 5, 20)), 32.0, np.zeros((N, 2)), np.ones((N, 2)), np.ones(N))),
-    "pack_columns": (
-        _core.pack_columns,
+    "measure": (
+        partial(_core.measure, np.zeros((4, 5, 20)), 32.0),
         (
-            *(np.zeros(shape) for shape in ((2, N), (2, 2, N), (N, 2), (N, 2, 2), (N, 2), N)),
+            *(np.ones(shape) for shape in ((N, 2), (N, 2, 2), (N, 2), N)),
             np.zeros(N, np.int32),
             *(np.zeros(N) for _ in range(3)),
         ),
@@ -108,7 +108,7 @@ CALLS = {
 }
 # Constructors check the indices only where they know what the indices refer to; `log_ratios` only compares cameras.
 UNCHECKED = {"DiscColumns", "DetectionColumns", "log_ratios"}
-ANY_LENGTH = {"inverses", "look_up", "Viewpoints"}  # functions of arrays whose lengths are independent
+ANY_LENGTH = {"inverses", "Viewpoints"}  # functions of arrays whose lengths are independent
 
 
 def alike(array: np.ndarray):

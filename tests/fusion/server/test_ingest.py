@@ -13,6 +13,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
 from camera_node.protocol.publishers import HANDOVER_NS
 from fusion.model.frames import CalibratedFrame
+from fusion.model.undistortion import OUTLINE
 from fusion.protocol.pose_messages import FusionStatus
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import ANOTHER_NODE, MAX_UNCALIBRATED, Ingest
@@ -223,4 +224,4 @@ def test_impossible_outlines_become_nan():
     message = message_of([[400, 300, 1, 1, 8.0, 9.0, 0.1, 0.6]], camera="cam0", seq=0, t_ns=START_NS)
     frame = Pipeline().ingest.receive(encode(message), KEYS.detections("cam0"), START_NS, ARENA.cameras)
     assert isinstance(frame, CalibratedFrame)
-    assert np.isnan(frame.roundels.axes_px).all()
+    assert np.isnan(frame.columns[OUTLINE]).all()
