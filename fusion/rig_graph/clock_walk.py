@@ -14,13 +14,12 @@ from scipy.special import chdtri
 
 from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array
-from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA
+from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, RIVAL
 
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock
 RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crystals have 1e-4, bad drivers more
 RATE_WALK = 1e-4  # change of a rate in a second: a daemon that slews a clock changes it by 5e-4 at once
 MEMORY_S = 10.0  # of errors of poses and lenses: what they do to offsets varies with the places of robots
-RIVAL = 1e-3  # likelihood of another camera at fault, relative to the accepted one
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtri, exp1
 
-from calib.rig.camera_errors import ERRORS, covariance_factor
+from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
@@ -32,6 +32,7 @@ Cause = Literal["pose", "clock", "focal"]
 FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [1.0, 0.1])
 POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
+RIVAL = 1e-3  # likelihood of another explanation, relative to the accepted one
 MAX_ITERATIONS, CONVERGED = 20, 1e-4  # relative decrease of the cost
 FIRST_DAMPING = 1e-4
 BEHIND = 1e6  # squared residual of a disc that is behind its camera
@@ -41,7 +42,6 @@ MAX_SUSPECTS = 4  # cameras that are combined to pairs: those that explain most 
 # Factors of the errors that the calibration states, which one linearization compares.
 SCALES = 2.0 ** np.arange(-4, 4.25, 0.25)
 ROUNDS = 4  # linearizations: robust weights rise as errors are explained
-KEPT = 2.0  # a factor below this changes the weights so little that the last linearization holds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,8 @@ class Window:
     Attributes:
         names: (C,) of the cameras.
         T: (C, 4, 4) their calibrated poses T_world_cam.
-        prior: (8 C, 8 C) covariance of the errors of the cameras.
+        prior: (8 C, 8 C) covariance of the errors of the cameras by the calibration.
+        since: (8 C,) variances of what changed since then: clocks and lenses.
         states: B bodies, with velocities that do not depend on single frames.
         velocity_sigma: (B, 2) of these: angular and linear, rad/s and m/s.
         single: (B,) bodies with one marker.
@@ -63,6 +64,7 @@ class Window:
     names: tuple[str, ...]
     T: Array
     prior: Array
+    since: Array
     states: States
     velocity_sigma: Array
     single: Mask
@@ -74,6 +76,10 @@ class Window:
     def camera(self) -> Index:
         """(N,) of each observation."""
         return self.observations.detections.camera
+
+    def covariance(self, scale: float) -> Array:
+        """(8 C, 8 C) of the errors of the cameras, if those of the calibration are larger than it states."""
+        return scale**2 * self.prior + np.diag(self.since)
 
     def select(self, keyframes: Mask) -> "Window":
         """The window of some of the keyframes."""
@@ -96,12 +102,16 @@ class Window:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """The errors (C, 8) that are free, and where the search for them begins (C, 8); `cameras` are those at fault."""
+    """The errors (C, 8) that are free, and where the search for them begins (C, 8); `cameras` are those at fault.
+
+    The standard deviations of all other errors are `scale` times those of the calibration.
+    """
 
     cause: Cause | None
     cameras: tuple[int, ...]
     free: Mask
     start: Array
+    scale: float = 1.0
 
     @classmethod
     def of(
@@ -113,6 +123,10 @@ class Hypothesis:
         begin = np.zeros((n_cameras, ERRORS)) if start is None else np.where(free, start, 0.0)
         return cls(cause, tuple(cameras), free, begin)
 
+    def is_part_of(self, other: "Hypothesis") -> bool:
+        """Whether the other one frees all that this one does."""
+        return bool((self.free <= other.free).all()) and self.scale in (1.0, other.scale)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
@@ -120,6 +134,7 @@ class Fit:
 
     Attributes:
         cost: robust sum of squares, with the priors.
+        penalty: of the free parameters (Bayesian information criterion), and of the errors that a scale allows.
         errors: (C, 8) of the cameras, to be applied to `Window.T` by `retract`.
         prior: (8 C, 8 C) information about the errors by the calibration, where they are not free.
         reduced: (8 C, 8 C + 1) normal equations of the errors by the observations, robots eliminated.
@@ -129,6 +144,7 @@ class Fit:
 
     hypothesis: Hypothesis
     cost: float
+    penalty: float
     errors: Array
     prior: Array
     reduced: Array
@@ -140,11 +156,6 @@ class Fit:
         """Least squares H e = y, (8 C, 8 C) and (8 C,), about the errors by the observations alone."""
         H, g = self.reduced[:, :-1], self.reduced[:, -1]
         return H / self.variance, (g + H @ self.errors.ravel()) / self.variance
-
-    @property
-    def penalty(self) -> float:
-        """Of the free parameters (Bayesian information criterion)."""
-        return float(self.hypothesis.free.sum() * np.log(2 * len(self.squared)))
 
     @property
     def variance(self) -> float:
@@ -218,7 +229,7 @@ class Verdict:
         cameras: at fault; if the data do not decide, those that contradict each other; empty without a fault.
         fit: of the best hypothesis.
         misfit: mean squared residual without a fault in units of its expectation, not below 1.
-        scale: of the errors that the calibration states, without a fault of single cameras.
+        scale: of the errors that the calibration states, without a fault of single cameras: the most likely one.
     """
 
     cause: Cause | None
@@ -226,6 +237,11 @@ class Verdict:
     fit: Fit
     misfit: float = 1.0
     scale: float = 1.0
+
+    @property
+    def is_of_rig(self) -> bool:
+        """Whether the errors of all cameras are larger than stated, and no single camera explains that."""
+        return not self.cameras and self.fit.hypothesis.scale > 1.0
 
 
 def retract(T: Array, errors: Array) -> Array:
@@ -246,12 +262,13 @@ def judge(window: Window, starts: Array) -> Verdict:
     n = len(window.names)
     none = fit(window, Hypothesis.of(None, (), n))
     if not is_contradicted(none, n):
-        return Verdict(None, (), none, scale=_most_likely_scale(window, none))
-    verdict = replace(_compare(window, none, starts), misfit=none.misfit)
-    return verdict if verdict.cause else replace(verdict, scale=error_scale(window, none))
+        return Verdict(None, (), none, scale=_scaled(window, none).hypothesis.scale)
+    scaled = _scaled(window, none)
+    verdict = replace(_compare(window, [none, scaled], starts), misfit=none.misfit)
+    return verdict if verdict.cause else replace(verdict, scale=scaled.hypothesis.scale)
 
 
-def _compare(window: Window, none: Fit, starts: Array) -> Verdict:
+def _compare(window: Window, as_stated: Sequence[Fit], starts: Array) -> Verdict:
     n = len(window.names)
     everything = fit(window, Hypothesis.of(None, range(n), n, starts))
     if not everything.is_adequate():  # nor is any other hypothesis
@@ -260,37 +277,43 @@ def _compare(window: Window, none: Fit, starts: Array) -> Verdict:
     if n > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
-    return decide([none, *fits, everything], n)
+    return decide([*as_stated, *fits], n)
 
 
-def error_scale(window: Window, none: Fit) -> float:
-    """How many times as large as the calibration states the errors of all cameras are, if that is what a window shows:
-    the maximum of the marginal likelihood (MacKay 1992), cameras and robots integrated out.
+def _scaled(window: Window, none: Fit) -> Fit:
+    """The fit with all errors of all cameras larger than the calibration states, by the most likely factor: the maximum
+    of the marginal likelihood (MacKay 1992), cameras and robots integrated out.
 
     Args:
         window: the keyframes.
         none: the fit without a fault.
     """
-    scale = 1.0
     for _ in range(ROUNDS):
-        factor = _most_likely_scale(window, none)
-        scale *= factor
-        if factor < KEPT:
+        scale = max(1.0, none.hypothesis.scale * _most_likely_scale(window, none))
+        if scale == none.hypothesis.scale:
             break
-        window = replace(window, prior=factor**2 * window.prior)
-        none = fit(window, none.hypothesis)
-    return scale
+        none = fit(window, replace(none.hypothesis, scale=scale))
+    return none
 
 
 def _most_likely_scale(window: Window, none: Fit) -> float:
-    """The best of `SCALES`, by the linearized problem: with S the prior, A the information of the window about the
+    """The best of `SCALES`, by the linearized problem: with S the covariance, A the information of the window about the
     errors x of the cameras and b = A x at its maximum, log L = (b^T (A + S^-1)^-1 b - log det(I + S A)) / 2."""
-    A, b = none.reduced[:, :-1] / none.variance, none.reduced @ np.append(none.errors.ravel(), 1.0)
-    L = covariance_factor(window.prior)
-    information, directions = np.linalg.eigh(L.T @ A @ L)
-    seen = np.outer(SCALES**2, np.maximum(information, 0.0))
-    gain = np.outer(SCALES**2, (directions.T @ (L.T @ b / none.variance)) ** 2) / (1 + seen) - np.log1p(seen)
-    return float(SCALES[gain.sum(axis=1).argmax()])
+    A, b = (
+        none.reduced[:, :-1] / none.variance,
+        none.reduced @ np.append(none.errors.ravel(), 1.0) / none.variance,
+    )
+
+    def gain(scale: float) -> float:
+        S = window.covariance(scale * none.hypothesis.scale)
+        return float(b @ S @ np.linalg.solve(np.eye(len(S)) + A @ S, b)) - _allowed(S, A)
+
+    return float(max(SCALES, key=gain))
+
+
+def _allowed(S: Array, A: Array) -> float:
+    """How much errors of covariance S allow a fit to observations with information A about them: log det(I + S A)."""
+    return float(np.linalg.slogdet(np.eye(len(S)) + S @ A)[1])
 
 
 def is_contradicted(none: Fit, n_cameras: int) -> bool:
@@ -304,21 +327,31 @@ def decide(fits: Sequence[Fit], n_cameras: int) -> Verdict:
     """Accept the best hypothesis if it beats all others, and if a majority of the cameras is not at fault.
 
     A hypothesis that frees more than the best one is no rival: it contains that one, and its penalty says that it
-    explains no more.
+    explains no more. A rival that blames no camera, but the scale of all errors, is refuted by `RIVAL`.
     """
     variance = min(f.variance for f in fits)
     score = {id(f): f.cost / variance + f.penalty for f in fits}
     best = min(fits, key=lambda f: score[id(f)])
-    limit = score[id(best)] + chdtri(CAUSES["pose"].stop, FALSE_ALARM)
+    margin = {
+        True: chdtri(CAUSES["pose"].stop, FALSE_ALARM),
+        False: chdtri(2, RIVAL),
+    }  # whether it blames a camera
     rivals = [
-        f for f in fits if not (best.hypothesis.free <= f.hypothesis.free).all() and score[id(f)] < limit
+        f
+        for f in fits
+        if not best.hypothesis.is_part_of(f.hypothesis)
+        and score[id(f)] < score[id(best)] + margin[bool(f.hypothesis.cameras)]
     ]
     cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
-    if not rivals and not cameras:
-        return Verdict(None, (), best)
-    if not rivals and cause is not None and 2 * len(cameras) < n_cameras:
+    if not rivals and 2 * len(cameras) < n_cameras:
         return Verdict(cause, cameras, best)
-    return Verdict(None, tuple(sorted({k for f in (best, *rivals) for k in f.hypothesis.cameras})), best)
+    possible = [f.hypothesis for f in (best, *rivals)]
+    named = (
+        range(n_cameras)
+        if any(h.scale != 1.0 for h in possible)
+        else {k for h in possible for k in h.cameras}
+    )
+    return Verdict(None, tuple(sorted(named)), best)
 
 
 def _suspects(poses: Sequence[Fit]) -> list[int]:
@@ -328,7 +361,7 @@ def _suspects(poses: Sequence[Fit]) -> list[int]:
 
 def fit(window: Window, hypothesis: Hypothesis) -> Fit:
     """Fit cameras and robots from the start of the hypothesis, by Levenberg-Marquardt with Cauchy weights."""
-    prior = _prior(window, hypothesis.free)
+    prior = _prior(window, hypothesis)
     at = _evaluate(window, hypothesis, prior, hypothesis.start, np.zeros((len(window.states), 12)))
     damping = FIRST_DAMPING
     for _ in range(MAX_ITERATIONS):
@@ -342,13 +375,18 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
         if is_converged:
             break
     reduced, _ = _eliminate(window, at, 0.0)
-    return Fit(hypothesis, at.cost, at.errors, at.prior, reduced, at.rows[:, :, 12:-1], at.squared)
+    penalty = float(hypothesis.free.sum() * np.log(2 * len(at.squared)))
+    if hypothesis.scale != 1.0:
+        stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
+        penalty += np.log(2 * len(at.squared)) + larger - stated
+    return Fit(hypothesis, at.cost, penalty, at.errors, at.prior, reduced, at.rows[:, :, 12:-1], at.squared)
 
 
-def _prior(window: Window, free: Mask) -> Array:
+def _prior(window: Window, hypothesis: Hypothesis) -> Array:
     """(8 C, 8 C) information about the errors, without that about the free ones."""
-    held = ~free.ravel()
-    covariance = window.prior * np.outer(held, held) + np.diag((free * FREE_SIGMA**2).ravel())
+    held = ~hypothesis.free.ravel()
+    covariance = window.covariance(hypothesis.scale) * np.outer(held, held)
+    covariance += np.diag((hypothesis.free * FREE_SIGMA**2).ravel())
     return np.asarray(np.linalg.inv(covariance), float)
 
 

@@ -28,7 +28,7 @@ from fusion.model.observations import (
     MatchedObservations,
 )
 from fusion.model.states import Snapshot, States
-from fusion.rig_graph.hypotheses import FREE_SIGMA, Window
+from fusion.rig_graph.hypotheses import CAUSES, FREE_SIGMA, Window
 
 SEARCH_PX = 120.0  # largest image shift: 8 degrees at a focal length of 840 px
 BIN_PX = 6.0
@@ -310,7 +310,8 @@ def _assemble(
     return Window(
         names=cameras.names,
         T=np.array([cameras[name].matrix() for name in cameras.names]),
-        prior=_prior(cameras, exposures),
+        prior=cameras.covariance,
+        since=_since(cameras, exposures),
         states=states,
         velocity_sigma=velocity_sigma(keyframes, robots),
         single=single,
@@ -336,13 +337,13 @@ def _are_determined(robot: Index, camera: Index) -> Mask:
     return determined[robot]
 
 
-def _prior(cameras: CameraArray, exposures: Exposures) -> Array:
-    """(8 C, 8 C) covariance of the errors of the calibrated cameras, with what clocks and lenses change since then."""
-    covariance = cameras.covariance + np.diag(np.tile(FREE_SIGMA * NEGLIGIBLE, len(cameras.names)) ** 2)
+def _since(cameras: CameraArray, exposures: Exposures) -> Array:
+    """(8 C,) variances of what clocks and lenses change after the calibration, and of the smallest errors otherwise."""
+    variance = np.tile((FREE_SIGMA * NEGLIGIBLE) ** 2, (len(cameras.names), 1))
     for k, name in enumerate(cameras.names):
-        camera, first = cameras[name], ERRORS * k
+        camera = cameras[name]
         stamps_s = exposures.tau_sigma[exposures.camera == k].max(initial=0.0)
-        covariance[first + 6, first + 6] += OFFSET_SIGMA_S**2 + stamps_s**2
+        variance[k, CAUSES["clock"]] += OFFSET_SIGMA_S**2 + stamps_s**2
         focal = camera.lens_sigma[0] / camera.fx if camera.lens_sigma is not None else FOCAL_STABILITY
-        covariance[first + 7, first + 7] += focal**2
-    return covariance
+        variance[k, CAUSES["focal"]] += focal**2
+    return variance.ravel()

@@ -99,6 +99,9 @@ class RigMonitor:
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._was_doubtful = False
         self._size_m = 0.0  # of what contradicts, at the robots
+        self._scale = (
+            1.0  # of the rig's errors, accepted; claims may count them larger while nothing is decided
+        )
         self.executor: Executor | None = None
         self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
         self.excluded: set[str] = set()
@@ -109,6 +112,7 @@ class RigMonitor:
         """Continue with the same cameras and other robots."""
         self.inherit_poses(old)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
+        self._scale = old._scale
         self._cameras.scale_errors(old._cameras.error_scale)
 
     def inherit_poses(self, old: "RigMonitor") -> None:
@@ -186,7 +190,7 @@ class RigMonitor:
         ):
             self._checked_ns = now.t_ns
             self._revision = self._cameras.revision
-            given = self._cameras.as_dict(), self._cameras.error_scale  # of this moment
+            given = self._cameras.as_dict(), self._scale  # of this moment
             self._given_ns = kept[-1].t_ns
             job = partial(judge_latest, tuple(kept), *given, self._markers, self._measured_ns)
             self._job = _done(job) if self.executor is None else self.executor.submit(job)
@@ -211,14 +215,19 @@ class RigMonitor:
     ) -> tuple[ExtrinsicsCorrection, ...]:
         names = tuple(window.names[k] for k in verdict.cameras)
         self._note_clocks(verdict, measured)
-        self._is_contradicted = bool(names)
+        is_open = verdict.is_of_rig or (bool(names) and verdict.cause is None)
+        self._n_undecided = self._n_undecided + 1 if is_open else 0
+        if self._n_undecided == 1:  # keyframes from before the change may make any hypothesis look right
+            self._keyframes.clear()
+        self._is_contradicted = bool(names) or self._n_undecided == 1
         if verdict.cause is None:
-            self._cameras.scale_errors(next_scale(self._cameras.error_scale, verdict))
+            scales = next_scales(self._scale, self._cameras.error_scale, verdict, self._n_undecided > 1)
+            self._scale, claimed = scales
+            self._cameras.scale_errors(claimed)
         if names:
             self._size_m = _claim_m(window) * verdict.misfit**0.5
-        self._n_undecided = self._n_undecided + 1 if names and verdict.cause is None else 0
         self._note_undecided(names if self._n_undecided >= CONFIRMED else self._underrated())
-        if not names:
+        if not self._is_contradicted:
             return self._returned(window)
         if verdict.cause != "pose" or names[0] in self.pinned:
             return ()
@@ -319,6 +328,7 @@ class RigMonitor:
         self._forget()
         self._walk.forget_poses()
         self._is_contradicted, self._n_undecided = False, 0
+        self._scale = 1.0
         self._cameras.scale_errors(1.0)
         self._clocks.clear()
         self._note_undecided(())
@@ -363,10 +373,12 @@ def _measure(
     return int(times[is_new].mean()), *fit(window.select(is_new), verdict.fit.hypothesis).equations
 
 
-def next_scale(scale: float, verdict: Verdict) -> float:
-    """The factor of the rig's errors after a verdict that finds no camera at fault. It falls slowly: a window shows a
-    part of the arena."""
-    return max(1.0, scale * max(verdict.scale, 1.0 if verdict.cameras else FALL))
+def next_scales(accepted: float, claimed: float, verdict: Verdict, is_confirmed: bool) -> tuple[float, float]:
+    """The factors of the rig's errors that is accepted and that claims have, after a verdict that finds no single
+    camera at fault. Claims grow at once. Both fall slowly: a window shows a part of the arena."""
+    found, fall = accepted * verdict.scale, 1.0 if verdict.cameras or verdict.is_of_rig else FALL
+    accepted = found if verdict.is_of_rig and is_confirmed else max(1.0, accepted * fall)
+    return accepted, max(accepted, found, claimed * fall)
 
 
 def _is_stationary(cost: Array) -> bool:

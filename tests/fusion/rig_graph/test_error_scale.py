@@ -5,9 +5,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from fusion.rig_graph.hypotheses import Verdict
-from fusion.rig_graph.rig_monitor import next_scale
+from fusion.rig_graph.rig_monitor import next_scales
 from tests.benchmarks.fusion_load import Load
 from tests.fusion.clock_faults import Outcome, fuse, inaccurate, seconds
+from tests.fusion.rig_graph.test_hypotheses import fitted
 
 LOAD = Load(robots=3, cameras=4, hz=30.0, speed_m_s=0.7, crossing=True)
 BEGUN_S = 1.5  # six keyframes, and three judgements
@@ -38,9 +39,18 @@ def test_a_rig_without_errors_keeps_its_claims():
 
 def test_claims_grow_at_once_and_fall_slowly():
     def verdict(scale: float, *cameras: int) -> Verdict:
-        return Verdict(None, cameras, None, scale=scale)  # pyright: ignore[reportArgumentType]
+        return Verdict(None, cameras, fitted(None, (), 2, 0.0), scale=scale)
 
-    assert next_scale(1.0, verdict(16.0, 0, 1)) == 16.0
-    assert 8.0 < next_scale(16.0, verdict(0.1)) < 16.0
-    assert next_scale(16.0, verdict(0.1, 0, 1)) == 16.0  # cameras contradict each other still
-    assert next_scale(1.0, verdict(0.1)) == 1.0  # never below what the rig states
+    def of_rig(scale: float) -> Verdict:
+        return Verdict(None, (), fitted(None, (), 2, 0.0, scale), scale=scale)
+
+    assert next_scales(1.0, 1.0, verdict(16.0, 0, 1), True) == (1.0, 16.0)  # undecided: only claims grow
+    assert next_scales(1.0, 1.0, of_rig(16.0), False) == (1.0, 16.0)
+    assert next_scales(1.0, 1.0, of_rig(16.0), True) == (16.0, 16.0)
+    accepted, claimed = next_scales(16.0, 32.0, verdict(0.1), False)
+    assert 8.0 < accepted < 16.0 < claimed < 32.0
+    assert next_scales(1.0, 16.0, verdict(0.1, 0, 1), True) == (
+        1.0,
+        16.0,
+    )  # cameras contradict each other still
+    assert next_scales(1.0, 1.0, verdict(0.1), False) == (1.0, 1.0)  # never below what the rig states

@@ -96,11 +96,16 @@ def test_elimination_gives_the_solution_of_the_whole_system():
     np.testing.assert_allclose(of_bodies.ravel(), whole[: 12 * bodies], rtol=1e-8, atol=1e-10)
 
 
-def fitted(cause: str | None, cameras: tuple[int, ...], n_cameras: int, cost: float) -> Fit:
-    """A fit of 400 observations with this cost."""
+def fitted(
+    cause: str | None, cameras: tuple[int, ...], n_cameras: int, cost: float, scale: float = 1.0
+) -> Fit:
+    """A fit of 400 observations with this cost, which show nothing of the cameras' errors."""
     hypothesis = Hypothesis.of(cause, cameras, n_cameras)  # pyright: ignore[reportArgumentType]
     empty, n = np.zeros((0, 0)), n_cameras * ERRORS
-    return Fit(hypothesis, cost, np.zeros((n_cameras, ERRORS)), np.eye(n), empty, empty, np.full(400, 1.0))
+    errors, prior = np.zeros((n_cameras, ERRORS)), np.eye(n) / scale**2
+    reduced, penalty = np.zeros((n, n + 1)), float(hypothesis.free.sum() * np.log(800))
+    hypothesis = replace(hypothesis, scale=scale)
+    return Fit(hypothesis, cost, penalty, errors, prior, reduced, empty, np.full(400, 1.0))
 
 
 def test_the_camera_is_named_that_explains_more_than_every_other():
@@ -115,6 +120,19 @@ def test_two_cameras_that_explain_the_same_are_both_named_and_nothing_is_decided
     fits += [fitted("pose", (k,), n_cameras, cost) for k, cost in ((0, 405.0), (1, 400.0))]
     verdict = decide(fits, n_cameras)
     assert (verdict.cause, verdict.cameras) == (None, (0, 1))
+
+
+@pytest.mark.parametrize(("cost", "cause", "cameras"), [(440.0, None, (0, 1, 2)), (460.0, "pose", (1,))])
+def test_a_camera_is_named_only_if_larger_errors_of_all_explain_less(cost: float, cause: str, cameras: tuple):
+    fits = [fitted(None, (), 3, 2000.0), fitted("pose", (1,), 3, 400.0), fitted(None, (), 3, cost, 8.0)]
+    verdict = decide(fits, 3)
+    assert (verdict.cause, verdict.cameras) == (cause, cameras)
+    assert not verdict.is_of_rig
+
+
+def test_errors_of_all_cameras_are_larger_if_no_camera_explains_them():
+    fits = [fitted(None, (), 3, 2000.0), fitted("pose", (1,), 3, 1000.0), fitted(None, (), 3, 400.0, 8.0)]
+    assert decide(fits, 3).is_of_rig
 
 
 def test_half_of_the_cameras_are_never_at_fault_against_the_others():
