@@ -8,7 +8,7 @@ from fusion.rig_graph.hypotheses import Verdict
 from fusion.rig_graph.rig_monitor import next_scales
 from tests.benchmarks.fusion_load import Load
 from tests.fusion.clock_faults import Outcome, fuse, inaccurate, seconds
-from tests.fusion.rig_graph.test_hypotheses import fitted
+from tests.fusion.rig_graph.fits import fitted
 
 LOAD = Load(robots=3, cameras=4, hz=30.0, speed_m_s=0.7, crossing=True)
 BEGUN_S = 1.5  # six keyframes, and three judgements

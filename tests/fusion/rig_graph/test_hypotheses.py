@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from fusion import _core
-from fusion.rig_graph.hypotheses import CAUSES, ERRORS, Fit, Hypothesis, decide, retract
+from fusion.rig_graph.hypotheses import CAUSES, ERRORS, Hypothesis, decide, retract
 from tests.fusion.native.scene import ARRAY, CAMERAS, scene
+from tests.fusion.rig_graph.fits import fitted
 
 STEP = 1e-6  # rad, m and s of a central difference quotient: an error of its square, and of rounding over it
 
@@ -94,18 +95,6 @@ def test_elimination_gives_the_solution_of_the_whole_system():
     np.testing.assert_allclose(step, whole[12 * bodies :], rtol=1e-8, atol=1e-10)
     of_bodies = by_body[:, :, -1] - by_body[:, :, :-1] @ step
     np.testing.assert_allclose(of_bodies.ravel(), whole[: 12 * bodies], rtol=1e-8, atol=1e-10)
-
-
-def fitted(
-    cause: str | None, cameras: tuple[int, ...], n_cameras: int, cost: float, scale: float = 1.0
-) -> Fit:
-    """A fit of 400 observations with this cost, which show nothing of the cameras' errors."""
-    hypothesis = Hypothesis.of(cause, cameras, n_cameras)  # pyright: ignore[reportArgumentType]
-    empty, n = np.zeros((0, 0)), n_cameras * ERRORS
-    errors, prior = np.zeros((n_cameras, ERRORS)), np.eye(n) / scale**2
-    reduced, penalty = np.zeros((n, n + 1)), float(hypothesis.free.sum() * np.log(800))
-    hypothesis = replace(hypothesis, scale=scale)
-    return Fit(hypothesis, cost, penalty, errors, prior, reduced, empty, np.full(400, 1.0))
 
 
 def test_the_camera_is_named_that_explains_more_than_every_other():
