@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.errors import CalibrationError
+from camera_node.foundation.config import new_path
 from camera_node.foundation.errors import ConfigError, describe_failed_write
 
 MAX_OLD = 20  # versions that are kept
@@ -147,6 +148,5 @@ def _link_or_copy(path: Path, target: Path) -> None:
     except FileExistsError:
         raise
     except OSError:
-        part = target.with_name(f".{target.name}.part")
-        shutil.copy2(path, part)
-        os.replace(part, target)
+        with new_path(target) as part:
+            shutil.copy2(path, part)

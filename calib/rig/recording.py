@@ -20,6 +20,7 @@ from calib.rig.camera import Camera
 from calib.rig.file_history import History
 from calib.rig.recording_reader import PROFILE, ReadLimits, RecordingReader
 from calib.rig.recording_repair import repair_recording
+from camera_node.foundation.config import new_path
 from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
@@ -152,15 +153,8 @@ def new_recording(path: Path, overwrite: bool = True) -> Iterator[RecordingWrite
     """
     if not overwrite and path.exists():
         raise ConfigError(f"{path} exists; give another name, or --force to replace it")
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with RecordingWriter(part, appears_at=path) as writer:
-            yield writer
-        os.replace(part, path)
-    except OSError as error:
-        raise unwritable(path, error) from None
-    finally:
-        part.unlink(missing_ok=True)
+    with new_path(path) as part, RecordingWriter(part, appears_at=path) as writer:
+        yield writer
 
 
 def wand_recording_path(rig: Path) -> Path:

@@ -8,8 +8,10 @@ import contextlib
 import difflib
 import os
 import re
+import shutil
 import stat
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -172,6 +174,38 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             raise
     except OSError as error:
         raise unwritable(path, error) from None
+
+
+@contextlib.contextmanager
+def hidden_folder(path: Path) -> Iterator[Path]:
+    """An empty folder beside `path`, for what is moved to `path` once it is complete; it is removed at the end.
+
+    Raises:
+        ConfigError: it can't be written, or the disk is full.
+    """
+    folder = path.with_name(f".{path.name}.part")
+    try:
+        shutil.rmtree(folder, ignore_errors=True)  # of a program that was killed
+        folder.mkdir()
+        yield folder
+    except OSError as error:
+        raise unwritable(path, error) from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def new_path(path: Path) -> Iterator[Path]:
+    """Where to write a file or folder that appears at `path` complete at the end, or not at all after an error.
+
+    Raises:
+        ConfigError: it can't be written, or the disk is full.
+    """
+    with hidden_folder(path) as folder:
+        yield folder / path.name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        os.replace(folder / path.name, path)
 
 
 class _Dumper(yaml.SafeDumper):

@@ -5,9 +5,10 @@ import shutil
 from collections import Counter
 from pathlib import Path
 
-from calib.rig.recording import RecordingWriter, read_messages
+from calib.rig.recording import new_recording, read_messages
 from calib.rig.recording_reader import ReadLimits
 from calib.rig.recording_repair import repair_recording
+from camera_node.foundation.config import new_path
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from fusion.recordings.recording_files import say_skipped
@@ -46,7 +47,7 @@ def _rewrite(recording: Path, out: Path | None, max_chunk_mb: float) -> int:
     if out is None or not max_chunk_mb > 0:
         raise ConfigError("--max-chunk-mb writes a new file; give a size above 0, and --out")
     size, faults = round(1e6 * max_chunk_mb), Counter[str]()
-    with RecordingWriter(out, overwrite=False) as writer:
+    with new_recording(out, overwrite=False) as writer:
         for entry in read_messages(recording, faults, ReadLimits(size, size)):
             writer.put(*entry)
     say_skipped(faults)
@@ -57,9 +58,7 @@ def _rewrite(recording: Path, out: Path | None, max_chunk_mb: float) -> int:
 def _copy(recording: Path, out: Path) -> None:
     if out.exists():
         raise ConfigError(f"{out} exists; give another name")
-    try:
-        shutil.copyfile(recording, out)
-    except OSError as error:
-        raise ConfigError(
-            f"{recording} can't be copied to {out}: {error.strerror}; check both paths"
-        ) from None
+    if not recording.is_file():
+        raise ConfigError(f"{recording} does not exist; give a recording")
+    with new_path(out) as part:
+        shutil.copyfile(recording, part)

@@ -5,10 +5,9 @@ import shlex
 import shutil
 from pathlib import Path
 
-from camera_node.foundation.config import example_file
+from camera_node.foundation.config import example_file, new_path
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
-from fusion.export.pose_formats import new_path
 
 NEXT = (
     "roundel detect {0}/frames/north --rig {0}/rig.yaml --name north --diameter 0.12",
@@ -28,8 +27,12 @@ def sample(folder: Path = Path("sample"), /) -> int:
     """
     if folder.exists():
         raise ConfigError(f"{folder} exists; give the name of a new folder, such as roundel sample {folder}2")
+    source = example_file("sample")
     with new_path(folder) as part:
-        shutil.copytree(example_file("sample"), part)
+        part.mkdir()
+        for path in sorted(source.rglob("*")):  # shutil.copytree collects errors to one without a number
+            target = part / path.relative_to(source)
+            target.mkdir() if path.is_dir() else shutil.copyfile(path, target)
     say(f"wrote {folder}: four cameras, three robots. Try, for example:")
     for command in NEXT:
         say(f"  {command.format(shlex.quote(str(folder)))}")

@@ -11,10 +11,10 @@ import numpy as np
 from calib.rig.camera import Camera
 from calib.rig.recording import read_messages
 from camera_node.foundation.arrays import Array
+from camera_node.foundation.config import new_path
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
 from camera_node.protocol.messages import MessageError, decode
-from fusion.export.pose_formats import new_path
 from fusion.export.recorded_poses import RecordedPoses
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
 

@@ -4,17 +4,16 @@
 import contextlib
 import csv
 import os
-import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any, Literal
 
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.foundation.config import write_atomically
-from camera_node.foundation.errors import ConfigError, unwritable
+from camera_node.foundation.config import hidden_folder, new_path, write_atomically
+from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
 from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.bridges.foxglove_channels import FoxgloveChannels
@@ -41,32 +40,6 @@ MM = 1000.0
 TRAIL_M = 0.004  # radius of a drawn trail
 ROW_GROUP = 1 << 14  # of a Parquet file: 10 MB in memory
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
-
-
-@contextlib.contextmanager
-def new_path(path: Path) -> Iterator[Path]:
-    """A hidden path beside `path` for a file or folder, which gets its name at the end; it is removed after an error.
-
-    Raises:
-        ConfigError: it can't be written, or the disk is full.
-    """
-    with _hidden_path(path) as part:
-        yield part
-        _remove(path)
-        os.replace(part, path)
-
-
-@contextlib.contextmanager
-def _hidden_path(path: Path) -> Iterator[Path]:
-    """The path of `new_path`; what is there in the end is removed."""
-    part = path.with_name(f".{path.name}.part{path.suffix}")
-    try:
-        _remove(part)
-        yield part
-    except OSError as error:
-        raise unwritable(path, error) from None
-    finally:
-        _remove(part)
 
 
 def require_own_format(path: Path, *own: str) -> None:
@@ -160,14 +133,13 @@ def write_tum(poses: RecordedPoses, path: Path) -> list[Path]:
     Returns:
         the files: `path`, or with several robots NAME-ROBOT and the suffix.
     """
-    with _hidden_path(path) as part, contextlib.ExitStack() as opened:
-        part.mkdir()
+    with hidden_folder(path) as folder, contextlib.ExitStack() as opened:
         written: dict[str, IO[str]] = {}
         for pose in poses:
             if pose.state == "lost":
                 continue
             if pose.robot not in written:
-                written[pose.robot] = opened.enter_context((part / f"{len(written)}").open("w"))
+                written[pose.robot] = opened.enter_context((folder / f"{len(written)}").open("w"))
             w, x, y, z = pose.quaternion_wxyz
             seconds, ns = divmod(pose.t_ns, 1_000_000_000)
             numbers = " ".join(f"{value:.9g}" for value in (*pose.position, x, y, z, w))
@@ -176,7 +148,7 @@ def write_tum(poses: RecordedPoses, path: Path) -> list[Path]:
         several = len(written) > 1
         files = [path.with_stem(f"{path.stem}-{robot}") if several else path for robot in written]
         for k, file in enumerate(files):
-            os.replace(part / f"{k}", file)
+            os.replace(folder / f"{k}", file)
     return files
 
 
@@ -332,10 +304,3 @@ def _log_pose(rr: Any, stream: Any, pose: RobotPose) -> None:
     )
     stream.log(f"world/uncertainty/{pose.robot}", ellipsoid)
     stream.log(f"residual_px/{pose.robot}", rr.Scalars(pose.residual_px or 0.0))
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

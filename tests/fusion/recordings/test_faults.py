@@ -156,17 +156,29 @@ def test_a_full_disk_ends_the_recording_in_one_line(tmp_path):
     assert f"{len(indexed(path))} messages" in lines[0]
 
 
-def test_a_result_on_a_full_disk_replaces_no_file(tmp_path):
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("trim", "{source}", "{out}", "--force"),
+        ("repair", "{source}", "--out", "{new}"),
+        ("repair", "{source}", "--out", "{new}", "--max-chunk-mb", "9"),
+        ("sample", "{new}"),
+    ],
+    ids=lambda words: " ".join(words),
+)
+def test_a_result_on_a_full_disk_replaces_no_file(tmp_path: Path, words: tuple[str, ...]):
     """What must appear whole is not completed: the error names the result, and nothing is left of it."""
-    source, out = tmp_path / "source.mcap", tmp_path / "part.mcap"
+    source, out, new = (tmp_path / f"{name}.mcap" for name in ("source", "part", "new"))
     write(source, entries(400))
     write(out, entries(10))
     before = out.read_bytes()
-    command = [sys.executable, "-c", FULL_DISK, str(LIMIT), "trim", str(source), str(out), "--force"]
+    filled = [word.format(source=source, out=out, new=new) for word in words]
+    command = [sys.executable, "-c", FULL_DISK, str(LIMIT), *filled]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert done.returncode == 2
-    assert f"{out} can't be written: {os.strerror(errno.EFBIG)}" in done.stderr
-    assert "closed" not in done.stderr
+    result = out if str(out) in filled else new
+    assert f"error: {result} can't be written: {os.strerror(errno.EFBIG)}" in done.stderr
+    assert done.stderr.count("\n") == 1
     assert out.read_bytes() == before
     assert sorted(tmp_path.iterdir()) == [out, source]
 
