@@ -93,8 +93,15 @@ class BodyFit:
     def covariances(self, P: Array, /) -> Array:
         """P (B, 12, 12) with those of the bodies that have observations; raises RuntimeError as `inverses`."""
 
+    def costs(self, squared: Array, /) -> Array:
+        """(B,) robust costs of the centres, whose squared residuals (N,) are in standard deviations, NaN where not
+        visible, and of the displacements from the predictions."""
+
     def centres(self) -> tuple[Array, Array, Array]:
         """The last equations of the centres (N, 2, 13), their weights (N,) and whitened residuals (N, 2)."""
+
+def squared_px(errors: Array, cov: Array, whiten: Array, /) -> Array:
+    """(N,) squared lengths in pixels of whitened errors (N, 2): cov, whiten (2, 2, N); NaN where `whiten` is."""
 
 class DetectionColumns:
     """N detections sorted by frame."""

@@ -408,9 +408,9 @@ class Assignments(Columns):
         """No assignment."""
         return cls.of(np.empty(0, np.intp), np.empty(0, np.intp))
 
-    def with_residuals(self, residuals_px: Array) -> "Assignments":
-        """The same with residuals (2, N)."""
-        return Assignments(self.detection, self.marker, np.sum(residuals_px**2, 0))
+    def with_residuals(self, squared_px: Array) -> "Assignments":
+        """The same with squared residuals (N,), px^2."""
+        return Assignments(self.detection, self.marker, squared_px)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -436,11 +436,11 @@ class MatchedObservations(Columns):
         """Detections of known discs, row by row, each captured when the detection was."""
         return cls(replace(discs, delay=detections.delay), detections, _whiten(detections))
 
-    def misfit(self, residuals_px: Array) -> Array:
-        """(N,) squares of residuals (2, N) in standard deviations, including `SLACK_PX`; infinite where these are NaN:
-        the disc is not visible."""
-        d2 = np.sum(residuals_px**2, 0) / (self.detections.variance_px2 + SLACK_PX**2)
-        return np.nan_to_num(d2, nan=np.inf)
+    def misfit(self, squared_px: Array) -> Array:
+        """(N,) squared residuals (N,), px^2, in standard deviations, including `SLACK_PX`; infinite where these are
+        NaN: the disc is not visible."""
+        d2 = squared_px / (self.detections.variance_px2 + SLACK_PX**2)
+        return np.where(np.isnan(d2), np.inf, d2)
 
 
 def _whiten(detections: DetectionTable) -> Array:

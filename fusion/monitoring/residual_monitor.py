@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri  # the inverse survival function of chi-square
 
 from camera_node.foundation.arrays import Array, Index
-from fusion._core import CAUCHY, SLACK_PX
+from fusion._core import SLACK_PX
 
 MIN_RESIDUALS = 12  # in a frame set
 MIN_RATIO = 2.0  # of an unusual residual to the usual one
@@ -20,7 +20,6 @@ SLACK_RATIO = 3.0  # of the largest calibration errors to the usual residual
 LEARNED = 15  # frame sets that define what is usual
 REJOINED = 0.01  # probability with which detections that agree are left out once more
 POSE_ERRORS = 6  # of a body, which detections determine first
-REJECTED = 100.0  # squared residual, in standard deviations, that a detection far away has
 FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 frame sets a second
 
 
@@ -39,7 +38,7 @@ class ResidualMonitor:
         """Whether most robots contradict their predictions by more than chance and more than usual.
 
         Args:
-            cost: (R,) of the fit of each robot, as by `costs_of`.
+            cost: (R,) of the fit of each robot, as of `BodyFit`.
             count: (R,) of its detections.
         """
         if self._learned < LEARNED or count.sum() < MIN_RESIDUALS:
@@ -66,20 +65,6 @@ class ResidualMonitor:
         share = 1 / min(self._learned, LEARNED)
         self._usual_px += share * (_median_px(squared_px) - self._usual_px)
         self._usual_cost += share * (_mean_cost(cost, count) - self._usual_cost)
-
-
-def costs_of(squared: Array, body: Index, corrections: Array, information: Array) -> Array:
-    """(R,) robust costs of the fits of R robots: observations and predictions.
-
-    Args:
-        squared: (N,) squared residuals in standard deviations; infinite where not visible.
-        body: (N,) the robots.
-        corrections: (R, 12) of the predicted states.
-        information: (R, 12, 12) of the predictions.
-    """
-    observed = CAUCHY**2 * np.log1p(np.minimum(squared, REJECTED) / CAUCHY**2)
-    predicted = np.einsum("ri,rij,rj->r", corrections, information, corrections)
-    return np.bincount(body, observed, len(corrections)) + predicted
 
 
 def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:

@@ -6,6 +6,8 @@
 namespace roundel::fusion {
 namespace {
 
+constexpr double kRejected = 100;  // squared residual, in standard deviations, that a detection far away has
+
 std::vector<size_t> rows_of(const bool* mask, size_t n) {
     std::vector<size_t> rows;
     for (size_t k = 0; k < n; ++k)
@@ -105,6 +107,18 @@ bool BodyFit::step(const ErrorVector* steps, double small) {
     }
     moving_ = std::move(moving);
     return !moving_.empty();
+}
+
+void BodyFit::write_costs(const double* squared, double* costs) const {
+    for (size_t b = 0; b < predicted_.size(); ++b) {
+        costs[b] = 0;
+        for (int i = 0; i < kErrors; ++i)
+            for (int j = 0; j < kErrors; ++j) costs[b] += delta_[b][i] * prior_[b][i][j] * delta_[b][j];
+    }
+    for (size_t k = 0; k < observed_.centres.discs.size(); ++k) {
+        const double bounded = squared[k] < kRejected ? squared[k] : kRejected;  // also of NaN
+        costs[owner_[k]] += kCauchy * kCauchy * std::log1p(bounded / (kCauchy * kCauchy));
+    }
 }
 
 void BodyFit::write_covariances(ErrorMatrix* P) const {

@@ -39,6 +39,9 @@ class BodyFit {
     const std::vector<Equations>& equations() const { return equations_; }
     const std::vector<double>& weights() const { return weights_; }
     const std::vector<std::array<double, 2>>& residuals() const { return residuals_; }
+    /// Writes the robust cost of each body: of its centres, whose squared residuals are given in standard
+    /// deviations (NaN where not visible), and of its displacement from the prediction.
+    void write_costs(const double* squared, double* costs) const;
     /// Writes the covariances of the bodies with observations; throws as `inverse`.
     void write_covariances(ErrorMatrix* P) const;
 

@@ -150,12 +150,12 @@ class Keyframes:
         inner, more = _mean_motion(early, late, robots)
         states = replace(now.states.select(robots), omega=mean[0], v=mean[1])
         change = np.mean((inner - mean) ** 2, axis=2).T - noise - more
-        views = tuple(self._view(frame, t_ns, now.states, robots) for frame in frame_set.frames)
+        rows = np.flatnonzero(np.isin(self._markers.robot, robots))
+        views = tuple(self._view(frame, t_ns, now.states, rows) for frame in frame_set.frames)
         return Keyframe(t_ns, views, robots, states, noise, WIDER * change)
 
-    def _view(self, frame: CalibratedFrame, t_ns: int, states: States, robots: Index) -> FrameView:
+    def _view(self, frame: CalibratedFrame, t_ns: int, states: States, rows: Index) -> FrameView:
         markers, tau = self._markers, (frame.t_ns - t_ns) * 1e-9
-        rows = np.flatnonzero(np.isin(markers.robot, robots))
         seen = ExpectedViews.of(self._cameras, frame.camera, states, tau, (markers, rows), frame.readout_s)
         return FrameView(frame, seen.rows, seen.points, seen.uv)
 

@@ -58,8 +58,8 @@ class _Sums:
     def zeros(cls, *shape: int) -> "_Sums":
         return cls(*np.zeros((5, *shape)))
 
-    def add(self, row: int | tuple[int, int], sample: tuple[float, ...]) -> None:
-        """Add a sample; those before it lose weight."""
+    def add(self, row: int | tuple[int, int | Index], sample: tuple[float, ...]) -> None:
+        """Add a sample to one row, or to several; those before it lose weight."""
         columns = self.squares, self.redundancy, self.rig, self.squares_m2, self.count
         for column, value in zip(columns, sample, strict=True):
             column[row] += value - column[row] / MEMORY
@@ -137,11 +137,10 @@ class ClaimCheck:
         whole, _ = equations.solve(np.ones(len(camera), bool), information, moved)
         self._all.add(robot, whole)
         self._samples[robot] += 1
-        for k in range(self._without.squares.shape[1]):
+        seeing = np.unique(camera)
+        self._without.add((robot, np.delete(np.arange(self._without.squares.shape[1]), seeing)), whole)
+        for k in seeing.tolist():
             out = camera == k
-            if not out.any():
-                self._without.add((robot, k), whole)
-                continue
             without, left_out_m2 = equations.solve(~out, information, moved)
             self._without.add((robot, k), without)
             self._left_out_m2[robot, k] += left_out_m2 - self._left_out_m2[robot, k] / MEMORY

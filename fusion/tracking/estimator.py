@@ -54,13 +54,15 @@ class BodyFit:
 
     Attributes:
         states: of all bodies; those without observations stay as predicted.
-        residuals: (2, N) in pixels, NaN where the disc is not visible.
+        squared_px: (N,) squared residuals, px^2; NaN where the disc is not visible.
+        cost: (B,) of each fit: observations and prediction, robust; chi-square if all claims hold.
         equations: (N, 2, 13) of the centres, as they were linearized last; see `_core.FramePoses`.
         weights: (N,) of these.
     """
 
     states: States
-    residuals: Array
+    squared_px: Array
+    cost: Array
     equations: Array
     weights: Array
 
@@ -95,13 +97,13 @@ class Estimator:
             small: rad and m; a body with a larger correction is linearized again.
 
         Returns:
-            the states, and the residuals (2, N) in pixels, NaN where the disc is not visible.
+            the states, and the squared residuals (N,), px^2, NaN where the disc is not visible.
 
         Raises:
             RuntimeError: the system of a body is singular (from GTSAM or the native core).
         """
         fitted = self.fit(prediction, self.prepared(prediction.states, observations), small)
-        return fitted.states, fitted.residuals
+        return fitted.states, fitted.squared_px
 
     def prepared(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """Observations as `fit` takes them: with straight outlines, and the noise of late frames and of clocks."""
@@ -111,7 +113,7 @@ class Estimator:
         """`update` by `prepared` observations."""
         states, seen, discs = prediction.states, observations.detections, observations.discs
         if not len(observations):
-            return BodyFit(states, np.empty((2, 0)), np.empty((0, 2, 13)), np.empty(0))
+            return BodyFit(states, np.empty(0), np.zeros(len(states)), np.empty((0, 2, 13)), np.empty(0))
         sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
         turned = read_headings(observations)
         with_headings, headings = observations.select(turned), np.empty((0, 2, 13))
@@ -139,7 +141,9 @@ class Estimator:
         if self.single.any():
             P[self.single] = reset_unobservable(P[self.single])
         equations, weights, residuals = fit.centres()
-        return BodyFit(_estimates(fit, P), _in_pixels(observations, residuals.T), equations, weights)
+        squared_px = _core.squared_px(residuals, seen.cov, observations.whiten)
+        cost = fit.costs(squared_px / seen.variance_px2)
+        return BodyFit(_estimates(fit, P), squared_px, cost, equations, weights)
 
     def with_time_errors(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """With the noise of late frames and of the clocks of the cameras."""
@@ -152,9 +156,10 @@ class Estimator:
         equations = poses.linearize_centres(discs.columns, seen.xy, observations.whiten, self.single)
         return equations[:, :, :12].reshape(-1, 12), equations[:, :, 12].ravel()
 
-    def residuals_px(self, states: States, observations: MatchedObservations) -> Array:
-        """(2, N) measured minus expected centres, NaN where the disc is not visible."""
-        return _in_pixels(observations, self.innovations(states, observations)[1].reshape(-1, 2).T)
+    def squared_px(self, states: States, observations: MatchedObservations) -> Array:
+        """(N,) squared distances of the centres from those expected, px^2; NaN where the disc is not visible."""
+        nu = self.innovations(states, observations)[1].reshape(-1, 2)
+        return _core.squared_px(nu, observations.detections.cov, observations.whiten)
 
     def select(self, rows: NDArray) -> "Estimator":
         """The estimator of some of the bodies."""
@@ -250,16 +255,6 @@ def _ordering(n: int) -> gtsam.Ordering:
     for k in range(n):
         ordering.push_back(k)
     return ordering
-
-
-def _in_pixels(observations: MatchedObservations, whitened: Array) -> Array:
-    """(2, N) residuals in pixels of N centres."""
-    x, y = whitened
-    cov = observations.detections.cov
-    u = np.sqrt(cov[0, 0])  # whitened = L^-1 pixels, where L L^T is the covariance
-    v = cov[0, 1] / u
-    error = np.stack([u * x, v * x + np.sqrt(cov[1, 1] - v * v) * y])
-    return np.where(np.isfinite(observations.whiten[0, 0]), error, np.nan)
 
 
 def _shaped(observations: MatchedObservations) -> Mask:

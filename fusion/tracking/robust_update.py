@@ -28,7 +28,7 @@ from fusion.model.observations import (
 )
 from fusion.model.states import POSITION, States
 from fusion.model.undistortion import COV
-from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault, costs_of
+from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
 
@@ -49,7 +49,7 @@ class RobustFit:
         prediction: the robots before the update.
         detections: of the frame set, with the noise that the fit gives them.
         observations, equations, weights: of the assignments, row by row; see `BodyFit`.
-        cost, count: (R,) of each robot: its fit, as by `costs_of`, and its detections.
+        cost, count: (R,) of each robot: its fit, as of `BodyFit`, and its detections.
     """
 
     states: States
@@ -114,12 +114,10 @@ class RobustUpdate:
         observations = MatchedObservations.of(assignments, detections, self._markers)
         observations = self._estimator.prepared(prediction.states, observations)
         fitted = self._estimator.fit(prediction, observations)
-        states, residuals = fitted.states, fitted.residuals
-        assignments = assignments.with_residuals(residuals)
+        states, assignments = fitted.states, assignments.with_residuals(fitted.squared_px)
         body, n = observations.discs.body, len(prediction.states)
-        squared = np.nan_to_num(np.sum(residuals**2, 0) / observations.detections.variance_px2, nan=np.inf)
-        cost = costs_of(squared, body, states.minus(prediction.states), prediction.information)
-        contradicted = mean_by_body(observations.misfit(residuals) > MAX_CHI2, body, n) > CONTRADICTED
+        is_large = observations.misfit(fitted.squared_px) > MAX_CHI2
+        contradicted = mean_by_body(is_large, body, n) > CONTRADICTED
         rows, equations, weights = np.flatnonzero(contradicted), fitted.equations, fitted.weights
         if len(rows):
             states = states.with_rows(rows, prediction.states.select(rows))
@@ -128,7 +126,7 @@ class RobustUpdate:
             equations, weights = equations[kept], weights[kept]
         count = np.bincount(body, minlength=n)
         return RobustFit(
-            states, assignments, prediction, detections, observations, equations, weights, cost, count
+            states, assignments, prediction, detections, observations, equations, weights, fitted.cost, count
         )
 
     def _without(self, k: int, fitted: RobustFit, assignments: Assignments) -> RobustFit:
@@ -195,9 +193,7 @@ class RobustUpdate:
         equations[used], weights[used] = fit.equations, fit.weights
         states = fitted.states.with_rows(displaced, fit.states.select(displaced))
         squared_px = fitted.assignments.squared_px.copy()
-        squared_px[rows[again]] = np.sum(
-            self._estimator.residuals_px(states, observations.select(again)) ** 2, 0
-        )
+        squared_px[rows[again]] = self._estimator.squared_px(states, observations.select(again))
         assignments = replace(fitted.assignments, squared_px=squared_px)
         return replace(fitted, states=states, assignments=assignments, equations=equations, weights=weights)
 

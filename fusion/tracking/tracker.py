@@ -147,8 +147,8 @@ class Tracker:
     ) -> AssociatedFrames:
         """Associate the frames that have arrived, while `n_missing` frames of the set have not.
 
-        An association costs as much as several frames. It is done when more frames are pending than missing: of
-        eight frames, after five and then after two more.
+        An association costs as much as several frames. It is done when three times as many frames are pending as
+        missing: of eight frames, after six.
 
         Args:
             frame_set: the frames that have arrived.
@@ -157,7 +157,7 @@ class Tracker:
         """
         associated = self.predict(frame_set.t_ns, early)
         pending = associated.association.pending(self.monitors.used(frame_set).frames)
-        return self.associate(associated, frame_set) if len(pending) > n_missing > 0 else associated
+        return self.associate(associated, frame_set) if len(pending) >= 3 * n_missing > 0 else associated
 
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""

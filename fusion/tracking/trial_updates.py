@@ -180,8 +180,8 @@ def refine(
     observations = replace(observations, discs=replace(observations.discs, body=body))
     estimator = estimator.select(starts.robot)
     prediction = estimator.predict(starts.states, np.full(n, START_S))
-    states, residuals = estimator.update(prediction, observations, SMALL)
-    d2 = observations.misfit(residuals)
+    states, squared_px = estimator.update(prediction, observations, SMALL)
+    d2 = observations.misfit(squared_px)
     rows = starts.robot.tolist()
     history = np.array(
         [table.history_chi2(k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]
@@ -195,7 +195,7 @@ def refine(
         is_expected,
         explained_shares(estimator.cameras, table.markers, detections, starts.robot, states),
         shared_views(starts.assignments, body, detections, n),
-        starts.assignments.with_residuals(residuals),
+        starts.assignments.with_residuals(squared_px),
         body,
     )
 

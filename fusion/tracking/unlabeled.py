@@ -323,8 +323,8 @@ class UnlabeledTracker:
         centres, up = np.zeros((3, len(rows))), np.tile([[0.0], [0.0], [1.0]], len(rows))
         discs = Discs(detections.frame[rows], body, body, centres, up, tracks.radius[seen][body])
         observations = MatchedObservations.of_discs(detections.select(rows), discs)
-        states, residuals = self._estimator(n).update(Prediction.without_motion(before), observations)
-        return states, mean_by_body(observations.misfit(residuals), body, n) < MAX_CHI2
+        states, squared_px = self._estimator(n).update(Prediction.without_motion(before), observations)
+        return states, mean_by_body(observations.misfit(squared_px), body, n) < MAX_CHI2
 
     def _estimator(self, n: int) -> Estimator:
         return Estimator(self._cameras, np.tile(MOTIONS["aerial"].densities, (n, 1)), np.ones(n, bool))

@@ -157,6 +157,12 @@ class ArrayFit {
         fit_.write_covariances(reinterpret_cast<ErrorMatrix*>(to));
         return fitted;
     }
+    Out costs(const Numbers& squared) const {
+        require_equal(discs_.frame.size(), {squared.size()});
+        auto [costs, to] = make({fit_.estimates().size()});
+        fit_.write_costs(squared.data(), to);
+        return costs;
+    }
     /// Of the centres: equations, weights and residuals.
     auto centres() const {
         const size_t n = discs_.frame.size();
@@ -190,6 +196,19 @@ class ArrayFit {
     std::tuple<Pairs, Matrices2, Mask, Pairs, Numbers, Matrices2, Numbers, Mask, Mask, Covariances> columns_;
     BodyFit fit_;
 };
+
+/// (N,) squared lengths in pixels of N whitened errors, whose covariances are `cov`; NaN where `whiten` is.
+Out squared_px(const In<double, -1, 2>& errors, const Matrices2& cov, const Matrices2& whiten) {
+    const size_t n = errors.shape(0);
+    const auto P = columns<4>(cov, n), scales = columns<4>(whiten, n);
+    auto [squares, to] = make({n});
+    for (size_t k = 0; k < n; ++k) {  // errors = L^-1 pixels, where L L^T is the covariance
+        const double a = std::sqrt(P.at(0, k)), b = P.at(1, k) / a, c = std::sqrt(P.at(3, k) - b * b);
+        const double u = a * errors(k, 0), v = b * errors(k, 0) + c * errors(k, 1);
+        to[k] = std::isfinite(scales.at(0, k)) ? u * u + v * v : std::numeric_limits<double>::quiet_NaN();
+    }
+    return squares;
+}
 
 auto respond_arrays(const FramePoses& poses, const Index& camera, size_t n_cameras,
                     const EquationArray& equations, const Numbers& weights, const Numbers& rig_share,
@@ -259,7 +278,9 @@ void bind_poses(nb::module_& m) {
         .def("step", &ArrayFit::step)
         .def("estimates", &ArrayFit::estimates)
         .def("covariances", &ArrayFit::covariances)
+        .def("costs", &ArrayFit::costs)
         .def("centres", &ArrayFit::centres);
+    m.def("squared_px", &squared_px);
     m.def("shears", &shears_of);
     m.def("respond", &respond_arrays);
     m.def("consider", &consider_arrays);

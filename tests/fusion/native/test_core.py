@@ -120,6 +120,23 @@ def test_a_fit_is_reweighted_least_squares_of_the_bodies_that_still_move():
         assert_near(estimates.minus(states.retract(delta)), np.zeros((BODIES, 12)))
         moving = moving[moving != 2]
     assert_near(fit.covariances(states.P)[moving], np.linalg.inv(H)[moving])
+    squared = np.append(random.uniform(0, 200, n - 1), np.nan)
+    observed = 16 * np.log1p(np.where(squared < 100, squared, 100) / 16)
+    moved = np.einsum("bi,bij,bj->b", delta, prior, delta)
+    assert_near(fit.costs(squared), np.bincount(discs.body, observed, BODIES) + moved)
+
+
+def test_whitened_errors_are_distances_in_pixels():
+    random = np.random.default_rng(3)
+    root, scale, pixels = random.normal(size=(5, 2, 3)), random.normal(size=(5, 2, 2)), np.ones((5, 2))
+    cov = root @ root.transpose(0, 2, 1)
+    inverse = np.linalg.inv(np.linalg.cholesky(cov))
+    whiten = np.ascontiguousarray((inverse @ scale).transpose(1, 2, 0))
+    whiten[..., 4] = np.nan
+    errors = (inverse @ pixels[..., None])[..., 0]
+    found = _core.squared_px(errors, np.ascontiguousarray(cov.transpose(1, 2, 0)), whiten)
+    assert_near(found[:4], 2 * np.ones(4))
+    assert np.isnan(found[4])
 
 
 def test_likelihoods_are_those_of_the_innovations():

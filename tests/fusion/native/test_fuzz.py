@@ -81,6 +81,7 @@ CALLS = {
             *(np.ones(N, bool), np.ones(N, bool), P, np.zeros((N, 2, 13))),
         ),
     ),
+    "squared_px": (_core.squared_px, (np.ones((N, 2)), SCALES, SCALES)),
     "log_ratios": (
         _core.log_ratios,
         (np.ones((N, 2, 12)), np.ones((N, 2)), np.ones(N), BODY, FRAME, np.zeros(N, bool), P, BODY, FRAME),
