@@ -9,24 +9,26 @@ import contextlib
 import io
 import logging
 import os
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import cast
 
+from mcap.records import Channel, Chunk
 from mcap.writer import IndexType, Writer
 
 from calib.rig.camera import Camera
 from calib.rig.file_history import History
 from calib.rig.recording_reader import PROFILE, ReadLimits, RecordingReader
-from calib.rig.recording_repair import repair_recording
+from calib.rig.recording_repair import encode_records, repair_recording
 from camera_node.foundation.config import new_path
 from camera_node.foundation.errors import ConfigError, unwritable
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
 
 LOG = logging.getLogger("calib")
 MIN_CHUNK, MAX_CHUNK = 1 << 16, 1 << 20  # bytes compressed together: the most that a cut-off loses
-MAX_LOST = 1 / 64  # of the file, between these: the writer remembers each chunk
+MAX_LOST = 1 / 64  # of the file, between these: the writer remembers each chunk; and of repeated definitions
 
 
 class RecordingWriter:
@@ -50,6 +52,8 @@ class RecordingWriter:
         self.counts: Counter[str] = Counter()
         self._mode = "wb" if overwrite else "xb"
         self._channels: dict[str, int] = {}
+        self._definitions = b""  # of the channels, repeated behind chunks
+        self._defined_at = 0  # in the file
         self._chunk, self._pending = MIN_CHUNK, 0  # bytes
 
     def __enter__(self) -> "RecordingWriter":
@@ -85,7 +89,8 @@ class RecordingWriter:
         try:
             if key not in self._channels:
                 encoding = "jpeg" if key.endswith("/snapshot") else "msgpack"
-                self._channels[key] = self._writer.register_channel(key, encoding, 0)
+                number = self._channels[key] = self._writer.register_channel(key, encoding, 0)
+                self._definitions += encode_records([Channel(number, key, encoding, {}, 0)])
             self._writer.add_message(self._channels[key], received_ns, data, received_ns, self.counts[key])
             self._pending += len(data)
             if self._pending >= self._chunk:
@@ -95,8 +100,17 @@ class RecordingWriter:
         self.counts[key] += 1
 
     def _end_chunk(self) -> None:
-        """Write the pending messages; the next chunk is larger as the file grows."""
+        """Write the pending messages; the next chunk is larger as the file grows.
+
+        The channels are defined again from time to time: without the index at the end, a damaged first chunk would
+        cost all messages.
+        """
         self._writer.flush()
+        if len(self._definitions) <= MAX_LOST * (self.size - self._defined_at):
+            content = self._definitions
+            chunk = Chunk("", content, 0, 0, zlib.crc32(content), len(content))  # only chunks have check sums
+            self._file.write(encode_records([chunk]))
+            self._defined_at = self.size
         self._chunk, self._pending = min(MAX_CHUNK, max(MIN_CHUNK, int(MAX_LOST * self.size))), 0
 
     def _close_full(self, error: OSError) -> ConfigError:

@@ -171,19 +171,19 @@ def _write_index(file: IO[bytes], content: _Content, max_size: int | None) -> No
 def _index(content: _Content) -> bytes:
     """The bytes behind the last chunk: the end of the data, the summary and the footer."""
     reader = content.reader
-    data_end = _encode([] if reader.has_header else [HEADER], [DataEnd(data_section_crc=0)])
+    data_end = encode_records([] if reader.has_header else [HEADER], [DataEnd(data_section_crc=0)])
     chunks = [chunk.index for chunk in content.chunks]
     definitions = [
         RECORD.pack(opcode, len(record)) + record
         for opcode, known in ((Opcode.SCHEMA, reader.schemas), (Opcode.CHANNEL, reader.channels))
         for record in known.values()
     ]
-    summary = b"".join(definitions) + _encode([_statistics(content)] if chunks else [], chunks)
+    summary = b"".join(definitions) + encode_records([_statistics(content)] if chunks else [], chunks)
     start = content.end + len(data_end) if summary else 0
     # the checksum covers the summary and the footer up to the checksum itself
-    unsigned = _encode([Footer(summary_start=start, summary_offset_start=0, summary_crc=0)])
+    unsigned = encode_records([Footer(summary_start=start, summary_offset_start=0, summary_crc=0)])
     crc = zlib.crc32(summary + unsigned[:-4])
-    footer = _encode([Footer(summary_start=start, summary_offset_start=0, summary_crc=crc)])
+    footer = encode_records([Footer(summary_start=start, summary_offset_start=0, summary_crc=crc)])
     return data_end + summary + footer + MAGIC
 
 
@@ -206,7 +206,8 @@ def _statistics(content: _Content) -> Statistics:
     )
 
 
-def _encode(*groups: Iterable[McapRecord]) -> bytes:
+def encode_records(*groups: Iterable[McapRecord]) -> bytes:
+    """The bytes of MCAP records, one after the other."""
     builder = RecordBuilder()
     for group in groups:
         for record in group:

@@ -98,6 +98,25 @@ def test_a_wrong_byte_anywhere_costs_one_chunk_and_is_reported(tmp_path: Path):
             assert (repaired.n_damaged, repaired.missing_s) == (reader.n_damaged, reader.missing_s), at
 
 
+@pytest.mark.parametrize("is_shifted", [False, True])
+def test_a_damaged_first_chunk_without_the_index_costs_no_other(tmp_path: Path, is_shifted: bool):
+    """Before: the first chunk alone defined the channels, and with it every message was lost. Bytes that are inserted
+    invalidate the index, too."""
+    path = tmp_path / "a.mcap"
+    entries = write(path, n=400)
+    data, starts = path.read_bytes(), chunk_starts(path)
+    at = starts[0] + 3000
+    cut_off = data[:at] + bytes(1) + data[at + 1 : starts[-1]]
+    path.write_bytes(data[:at] + bytes(77) + data[at:] if is_shifted else cut_off)
+    found, reader = read(path)
+    first = entries.index(found[0])
+    assert found == entries[first:][: len(found)]
+    assert 0 < first <= 70  # as many as a chunk has
+    assert first + len(found) == len(entries) if is_shifted else first + len(found) >= len(entries) - 70
+    assert reader.n_damaged
+    assert repair_recording(path).n_messages == len(found)
+
+
 def test_a_damaged_recording_of_an_arena_is_used_and_described(tmp_path: Path):
     """Each command goes on, and says how many messages and seconds are missing."""
     path = damaged_sample(tmp_path)

@@ -259,7 +259,7 @@ def test_a_long_recording_is_smoothed_in_parts_as_if_it_were_whole():
     arena = Arena(MOVING.robots, MOVING.motions, sigma_px=0.1, hidden=lambda robot, marker, t: 0.9 < t < 1.1)
     results, names = smoothed(arena, False, 120), tuple(arena.robots)
     seconds = 1e-9 * (results[-1].t_ns - results[0].t_ns)
-    parts, whole = Smoother(names, lag_ns=round(1e9)), Smoother(names)
+    parts, whole = Smoother(names), Smoother(names, lag_ns=round(1e12))
     in_parts = [[*parts.add(result)] for result in results]
     assert sum(map(len, in_parts)) >= len(results) * (1 - 2 / seconds)  # no more than twice the lag is held
     assert not any(whole.add(result) for result in results)
