@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a program needs of Roundel: robot poses, the detector, calibration and recordings.
 
-    from roundel import Arena, Detector, Recording, Rig, Robots, calibrate_intrinsics, calibrate_wand, simulate, track
+    from roundel import Arena, Detector, Recording, Rig, Robots
+    from roundel import calibrate_intrinsics, calibrate_wand, simulate, track
 
 | name | use |
 |---|---|

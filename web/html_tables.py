@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Tables, coloured texts and the style of the page, as HTML. All texts are escaped."""
 
+import base64
 import html
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 COLOURS = {"ok": "#40c8aa", "warn": "#f0a63a", "bad": "#ef5b5b", "wait": "#9aa0ac"}  # by level
@@ -18,7 +20,8 @@ STYLE = f"""<style>
   {PANEL} {{ position: relative !important; max-height: 55vh !important; flex: none }}
 }}
 th[title] {{ cursor: help; text-decoration: underline dotted #8886; text-underline-offset: 3px }}
-.roundel-pictures {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(180px, 1fr)); gap: 6px }}
+.roundel-pictures {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(170px, 1fr)); gap: 6px;
+  margin: 4px {MARGIN_PX}px 8px }}
 .roundel-pictures figure {{ margin: 0; font-size: 11px }}
 .roundel-pictures img {{ width: 100%; display: block; border-radius: 3px; background: #000; min-height: 60px }}
 </style>"""
@@ -83,6 +86,16 @@ class HtmlTable:
             f'<table style="{style}"><tr style="opacity:.65;vertical-align:bottom;line-height:1.2">{head}</tr>'
             f"{body}</table>"
         )
+
+
+def picture_grid(pictures: Iterable[tuple[str, str, str, bytes]]) -> str:
+    """Pictures side by side: what each shows, its caption, its type (png or jpeg) and its data."""
+    figures = "".join(
+        f'<figure><img alt="{html.escape(text)}" decoding="sync" src="data:image/{kind};base64,'
+        f'{base64.b64encode(data).decode()}"><figcaption>{html.escape(caption)}</figcaption></figure>'
+        for text, caption, kind, data in pictures
+    )
+    return f'<div class="roundel-pictures">{figures}</div>' if figures else ""
 
 
 def small(text: str, level: str = "wait") -> str:

@@ -135,7 +135,8 @@ def _camera_row(state: ArenaState, name: str, health: CameraHealth | None) -> Ta
         cells = (name, *[NO_VALUE] * (len(CAMERA_COLUMNS) - 1))
         return TableRow(cells, "bad", describe_silence(silence))
     own = timed.message if timed else None
-    advice = _advise(own.advice if own else "", health)
+    is_placed = state.rig is not None and name in state.rig.placed()
+    advice = _advise(own.advice if own else "", health, is_placed)
     cells = (
         name,
         _number(own and own.fps, 1),
@@ -166,11 +167,12 @@ def describe_silence(seconds: float) -> str:
     return f"{since}: check its cable and its program"
 
 
-def _advise(own_advice: str, health: CameraHealth | None) -> str:
+def _advise(own_advice: str, health: CameraHealth | None, is_placed: bool) -> str:
+    """The worst fault of a camera; the rig, which may place it, arrives before the server's next status."""
     if health is None:
         return own_advice
     reasons = {
-        "not calibrated": not health.calibrated,
+        "not calibrated": not (health.calibrated or is_placed),
         "moved: excluded until it is recalibrated": health.excluded,
         "repeats an old image: excluded until it delivers new ones": health.frozen,
         "its stamps may have jumped: robots in motion will show it": health.clock == "uncertain",

@@ -117,8 +117,8 @@ def collect_frames(
         subscriber.undeclare()
     if not collected.messages:
         raise CalibrationError(
-            f"no detections on {key} in {seconds:g} s ({collected.invalid} invalid messages); check that the server "
-            "and the cameras run, and check --connect and --arena"
+            f"no camera of arena '{arena}' sent detections in {seconds:g} s ({collected.invalid} invalid messages); "
+            f"roundel health --arena {arena} says why"
         )
     return collected, reason
 

@@ -49,12 +49,16 @@ class SessionProgress:
 
     @property
     def summary(self) -> str:
-        """The elapsed time, and the expected result."""
-        if self.trial is None or self.trial.expected_mm is None:
+        """The elapsed time, and the result of the latest trial, which may be that of much earlier frames."""
+        if self.trial is None:
             return f"{self.seconds:.0f} s"
-        return (
-            f"{self.seconds:.0f} s, grade {self.trial.grade}, expected error {self.trial.expected_mm:.2f} mm"
+        part, expected_mm = (
+            f"{self.seconds:.0f} s; the first {self.trial.until_s:.0f} s",
+            self.trial.expected_mm,
         )
+        if expected_mm is None:
+            return part
+        return f"{part} give grade {self.trial.grade}, expected error {expected_mm:.1f} mm"
 
     def cells(self) -> list[tuple[str, ...]]:
         """One row per camera: name, frames, share of the image, used part of the shared area, noise ratio; the last

@@ -10,7 +10,7 @@ import threading
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context, parent_process
 
 from calib.errors import CalibrationError
@@ -65,6 +65,7 @@ class Trial:
         expected_mm: expected error of points across the arena; None for a rig without scale.
         grade: of the trial.
         rig: the cameras that it placed, for a preview; None if it failed.
+        until_s: when its last frame was recorded, seconds since the session began.
     """
 
     fault: str = ""
@@ -75,6 +76,7 @@ class Trial:
     expected_mm: float | None = None
     grade: str = "D"
     rig: Rig | None = None
+    until_s: float = 0.0
 
 
 def _init_trial_process() -> None:
@@ -99,7 +101,7 @@ class TrialSolver:
         self._executor = _one_process() if settings.trials else None
         self._running: Future[Trial] | None = None
         self._latest: Trial | None = None
-        self._next_s = settings.trial_every_s
+        self._next_s, self._begun_s = settings.trial_every_s, 0.0
 
     def __enter__(self) -> "TrialSolver":
         return self
@@ -114,12 +116,13 @@ class TrialSolver:
         if self._executor is None:
             return None
         if self._running is not None and self._running.done():
-            self._latest, self._running = _collect(self._running), None
+            self._latest = replace(_collect(self._running), until_s=self._begun_s)
+            self._running = None
             self._next_s = now_s + self._settings.trial_every_s
         if self._running is None and now_s >= self._next_s and messages:
             part = select_blocks(messages)
             share = len(part) / len(messages)
-            self._running = self._submit(self._executor, part, share)
+            self._running, self._begun_s = self._submit(self._executor, part, share), now_s
         return self._latest
 
     def _submit(

@@ -204,8 +204,8 @@ def _explain_distances(points: Array, surveyed: Array) -> str:
     if len(points) > MAX_LISTED:
         return f"these are {expected}; measure them again, and check the scale of the calibration"
     return (
-        f"these are {expected}, the cameras see roundels at {_list_distances(points)}; correct its "
-        "file, or lay the roundels as the file says"
+        f"these are {expected}, the cameras see roundels at {_list_distances(points)}; lay the "
+        "roundels as the file says and take others away, or correct the file"
     )
 
 

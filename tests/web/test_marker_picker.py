@@ -28,13 +28,8 @@ HANDLED_S = 1.0  # after a click has arrived, another handler of it has run
 
 
 @pytest.fixture
-def arena(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Client, View, MarkerPicker]]:
-    """The page of a running arena with an undeclared robot.
-
-    The view draws five times a second: the browser has no graphics card and needs the time for clicks.
-    """
-    monkeypatch.setattr("web.view.PERIOD_S", 0.2)
-    monkeypatch.setattr("web.view.PANEL_INTERVAL", 2)
+def arena(tmp_path: Path) -> Iterator[tuple[Client, View, MarkerPicker]]:
+    """The page of a running arena with an undeclared robot."""
     with serving_an_unknown_robot(tmp_path) as (endpoint, client), ServerConnection([endpoint]) as connection:
         subscription = Subscription(connection, Feed("test"))
         make = lambda view: MarkerPicker(view.server, subscription)  # noqa: E731

@@ -10,8 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import msgspec
+import numpy as np
 
+from calib.rig.coverage import Coverage
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigHistory, RigMessage
 from camera_node.foundation.config import is_name
@@ -29,7 +32,6 @@ from camera_node.protocol.messages import (
 )
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import MAX_NUMBER, FusionStatus, Markers, RobotPose, Robots, robots_key
-from web.state.coverage_picture import CoveragePicture
 
 log = logging.getLogger("web")
 MAX_NAMES = 256  # cameras or robots of one arena; the feed counts further ones as faults
@@ -38,6 +40,10 @@ REMOVED_CAMERA_S = 5.0  # the same of a camera without a status
 MAX_PENDING = 1024  # keys whose latest message is not decoded yet
 COVERAGE_S = 0.1  # shortest time between two frames of a camera that extend its coverage
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
+WIDTH = 160  # pixels of one picture of the coverage
+MAX_ASPECT = 4.0  # height over width of one picture
+CELLS = (8, 8)  # of the grid for the covered share
+EMPTY, COVERED = np.array([38, 28, 24], np.uint8), np.array([170, 200, 64], np.uint8)  # blue, green, red
 _CONTAINERS = (
     "poses",
     "cameras",
@@ -49,6 +55,41 @@ _CONTAINERS = (
     "faults",
 )
 Vector = tuple[float, float, float]
+
+
+class CoveragePicture:
+    """A picture of one camera's image that shows where roundels were detected, and where the wand is still missing."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.size = (width, height)
+        self._mask = np.zeros((max(1, round(WIDTH * min(height / width, MAX_ASPECT))), WIDTH), bool)
+        self._coverage = Coverage(np.zeros(CELLS, np.int64))
+
+    def add(self, detections: Detections) -> None:
+        """Mark the roundels of one frame."""
+        uv = np.frombuffer(detections.uv, "<f8").reshape(-1, 2)
+        self._coverage += Coverage.of(uv, *self.size, CELLS)
+        relative = (uv + 0.5) / self.size
+        relative = relative[((relative >= 0) & (relative < 1)).all(axis=1)]
+        rows, columns = self._mask.shape
+        v, u = (relative[:, 1] * rows).astype(int), (relative[:, 0] * columns).astype(int)
+        for dv in (-1, 0, 1):
+            for du in (-1, 0, 1):
+                self._mask[np.clip(v + dv, 0, rows - 1), np.clip(u + du, 0, columns - 1)] = True
+
+    @property
+    def n_marked(self) -> int:
+        """Number of marked pixels; it grows with each change of the picture."""
+        return int(np.count_nonzero(self._mask))
+
+    @property
+    def share(self) -> float:
+        """The covered share of the image, 0 to 1, counted in 8 x 8 cells."""
+        return self._coverage.share()
+
+    def png(self) -> bytes:
+        """Return the picture, 160 pixels wide."""
+        return cv2.imencode(".png", np.where(self._mask[..., None], COVERED, EMPTY))[1].tobytes()
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The tab Cameras: what each camera does and sees."""
 
-import base64
-import html
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from contextvars import copy_context
 from functools import partial
@@ -23,10 +21,9 @@ from camera_node.protocol.registration import CameraChange
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import guarded
 from web.errors import WebError
-from web.html_tables import MARGIN_PX
+from web.html_tables import picture_grid
 from web.own_control import OwnControl, each_browser
 from web.scene.camera_frustums import CameraDrawing
-from web.state.coverage_picture import montage
 from web.state.feed import ArenaState
 from web.state.subscription import REQUEST_TIMEOUT_S, Subscription
 from web.tables import STALE_S, tabulate_cameras
@@ -54,7 +51,7 @@ class CameraTable:
         self._table = gui.add_html("")
         self._coverage_folder = gui.add_folder("Wand coverage", visible=False)
         with self._coverage_folder:
-            self._coverage = gui.add_image(montage({}))
+            self._coverage = gui.add_html("")
         self._marked: dict[str, int] = {}  # pixels of the pictures that are shown
 
     def update(self, state: ArenaState) -> None:
@@ -64,7 +61,12 @@ class CameraTable:
         set_property(self._coverage_folder, "visible", bool(state.coverage) and not calibrated)
         marked = {name: picture.n_marked for name, picture in state.coverage.items()}
         if self._coverage_folder.visible and marked != self._marked:
-            self._marked, self._coverage.image = marked, montage(state.coverage)
+            self._marked = marked
+            pictures = (
+                (f"where {name} saw roundels", f"{name}: {picture.share:.0%}", "png", picture.png())
+                for name, picture in sorted(state.coverage.items())
+            )
+            set_content(self._coverage, picture_grid(pictures))
 
 
 class LivePictures:
@@ -91,7 +93,7 @@ class LivePictures:
             for name, timed in sorted(state.previews.items())
             if is_watched and state.age_s(timed) < STALE_S
         }
-        set_content(self._grid, picture_grid(recent, state) if is_watched else "")
+        set_content(self._grid, picture_grid(_describe(preview, state) for preview in recent.values()))
         for name in state.previews:
             self._frustums.show_picture(name, recent[name].jpeg if name in recent else None)
 
@@ -100,17 +102,11 @@ class LivePictures:
         self._subscription.watch_previews(False)
 
 
-def picture_grid(previews: Mapping[str, Preview], state: ArenaState) -> str:
-    """The pictures as HTML, each with its camera's name and number of roundels."""
-    figures = []
-    for name, preview in previews.items():
-        seen = len(state.detections[name]) if name in state.detections else 0
-        jpeg = base64.b64encode(preview.jpeg).decode()
-        caption = f"{html.escape(name)}: {preview.width} x {preview.height}, {seen} roundels"
-        picture = f'<img alt="{html.escape(name)}" decoding="sync" src="data:image/jpeg;base64,{jpeg}">'
-        figures.append(f"<figure>{picture}<figcaption>{caption}</figcaption></figure>")
-    style = f"margin:4px {MARGIN_PX}px 8px"
-    return f'<div class="roundel-pictures" style="{style}">{"".join(figures)}</div>' if figures else ""
+def _describe(preview: Preview, state: ArenaState) -> tuple[str, str, str, bytes]:
+    """A camera's picture for `picture_grid`, with the number of its roundels."""
+    name = preview.camera
+    seen = len(state.detections[name]) if name in state.detections else 0
+    return name, f"{name}: {preview.width} x {preview.height}, {seen} roundels", "jpeg", preview.jpeg
 
 
 class CameraSettings:

@@ -33,10 +33,10 @@ def test_detections_are_collected_past_invalid_messages(endpoint: str):
         assert (len(collected.messages), collected.invalid) == (len(messages), 1)
 
 
-def test_no_detections_is_an_error_that_names_the_key(endpoint: str):
+def test_no_detections_is_an_error_that_names_the_arena(endpoint: str):
     with (
         open_router([endpoint]),
         open_client([endpoint]) as client,
-        pytest.raises(CalibrationError, match="no detections on test/"),
+        pytest.raises(CalibrationError, match="no camera of arena 'test' sent"),
     ):
         collect_with_progress(client, "test", 0.1, "collecting")

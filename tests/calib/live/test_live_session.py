@@ -93,7 +93,7 @@ def test_a_session_ends_after_its_time_or_by_the_user():
         reason = run_wand_session(client, "test", settings, show, stop)[1]
         done()
         assert "by the user" in reason
-        with pytest.raises(CalibrationError, match="no detections on test/"):
+        with pytest.raises(CalibrationError, match="no camera of arena 'test' sent"):
             run_wand_session(client, "test", replace(settings, seconds=0.1))
 
 

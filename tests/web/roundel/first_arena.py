@@ -2,9 +2,9 @@
 """A first arena: four unknown cameras on two machines, an operator who clicks in a browser, and a program with poses.
 
 The cameras are recordings, which `roundel up` and `roundel camera` play as live ones: of the first machine folders of
-pictures, of the second videos. Someone waves a wand for `WAND_S`, then sets a robot down for `STANDING_S`, which then
-drives on a circle. Each of the three motions repeats, so that few frames are rendered. `Operator` has no other means
-than the page.
+pictures, of the second videos. Someone waves a wand, lays the L-frame on the floor and takes it away, and sets a robot
+down, which then drives on a circle (`PHASES`). Each of these motions repeats, so that few frames are rendered; a loaded
+machine, on which the operator waits longer, has more repetitions. `Operator` has no other means than the page.
 """
 
 import contextlib
@@ -13,8 +13,10 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -34,22 +36,26 @@ from camera_node.simulation.simulated_camera import render_recording
 from camera_node.sources.recorded_frames import read_grey
 from tests.benchmarks.faults.network import Loopback
 from tests.conftest import free_port
-from tests.waiting import wait_for
+from tests.waiting import slowness, wait_for
 from tests.web.browser import CHROMIUM, FLAGS
 from tests.web.roundel.programs import Program, roundel_command
 
 SERVER, CAMERAS = "server", "cameras"  # the machines
+ROBOT = "rover"
 FOLDERS, VIDEOS = ("north", "east"), ("south", "west")  # the cameras of the first and of the second machine
 FPS = {"north": 20.0, "east": 19.75, "south": 20.25, "west": 19.5}  # whole numbers of frames in 4 s
-WAND_S, STANDING_S, DRIVING_S = 72.0, 60.0, 72.0
-WAND_PERIOD_S, STANDING_PERIOD_S, ROUND_S = 12.0, 4.0, 12.0
+ROUND_S = 12.0
 RADIUS_M = 0.6  # of the circle on which the robot drives
 DIAMETER_M = 0.09
+MARKERS = [[0.1, 0.0, 0.0], [-0.08, 0.05, 0.0], [-0.03, -0.11, 0.0]]  # of the robot
 STEP_MS = 60_000  # for the page to show the outcome of a step, on a loaded machine
 CALIBRATION_MS = 150_000
-LONG_ENOUGH = r"^(3[6-9]|[4-9]\d|1\d\d) s, grade ., expected error"  # three rounds of the wand
-WAIT_S = 60.0  # for the robot to drive
+LONG_ENOUGH = r"^(3[6-9]|[4-9]\d|1\d\d) s[:;]"  # three rounds of the wand
+START_S = 5.0  # of a camera's program
+MAX_TIMES = 2.0  # that phases are longer on a loaded machine
 N_POSES = 500  # two rounds at 20 a second
+HEIGHT_M = 0.15  # of the robot's markers above the floor
+CENTRE_M = np.add(np.mean(MARKERS, axis=0), [0.0, 0.0, HEIGHT_M])  # of the circle of the markers' mean
 STOOD_M = 0.1
 
 WAND_MOTION = {
@@ -60,46 +66,59 @@ WAND_MOTION = {
     "pitch_deg": {"amplitude": 18, "period_s": 4.0},
     "roll_deg": {"amplitude": 18, "period_s": 3.0, "phase_deg": 70},
 }
-STANDING = {"x_m": {"mean": 0.0}, "y_m": {"mean": RADIUS_M}, "z_m": {"mean": 0.15}}
+STANDING = {"x_m": {"mean": 0.0}, "y_m": {"mean": RADIUS_M}, "z_m": {"mean": HEIGHT_M}}
 DRIVING = {
     "x_m": {"amplitude": RADIUS_M, "period_s": ROUND_S},
     "y_m": {"amplitude": RADIUS_M, "period_s": ROUND_S, "phase_deg": 90},
-    "z_m": {"mean": 0.15},
+    "z_m": {"mean": HEIGHT_M},
 }
 
 
 @dataclass(frozen=True)
 class Phase:
-    """A part of the recording: `period_s` of it are rendered, and repeated until `seconds` are full."""
+    """A part of the recording: `period_s` of it are rendered, and repeated until `seconds` are full.
+
+    The arena contains the robot, or in its place the body of an example file, which moves as `motion` says.
+    """
 
     seconds: float
     period_s: float
-    is_wand: bool
-    robot_motion: dict
+    body: str
+    motion: dict
 
 
 PHASES = (
-    Phase(WAND_S, WAND_PERIOD_S, True, STANDING),
-    Phase(STANDING_S, STANDING_PERIOD_S, False, STANDING),
-    Phase(DRIVING_S, ROUND_S, False, DRIVING),
+    Phase(72.0, 12.0, "wand.yaml", WAND_MOTION),
+    Phase(60.0, 4.0, "l.yaml", {}),
+    Phase(60.0, 4.0, ROBOT, STANDING),
+    Phase(72.0, ROUND_S, ROBOT, DRIVING),
 )
 
 
 def render(folder: Path) -> None:
-    """Write the pictures `<camera>/<t_ns>.png` of `FOLDERS`, and the videos `<camera>/<camera>.avi` of `VIDEOS`."""
+    """Write one period of each phase, unless the folder has them."""
+    missing = [k for k in range(len(PHASES)) if not (folder / f"phase{k}").exists()]
     with ProcessPoolExecutor(
         mp_context=get_context("spawn")
     ) as processes:  # a fork has no thread of Zenoh or OpenCV
-        for done in [processes.submit(_render_phase, folder, k) for k in range(len(PHASES))]:
+        for done in [processes.submit(_render_phase, folder, k) for k in missing]:
             done.result()
+
+
+def repeat(folder: Path) -> float:
+    """Write the pictures `<camera>/<t_ns>.png` of `FOLDERS`, and the videos `<camera>/<camera>.avi` of `VIDEOS`, beside
+    the rendered phases; return how many times as long as `PHASES` these are."""
+    times = min(slowness(), MAX_TIMES)
     for name in FPS:
-        frames = _repeated(folder, name)
+        shutil.rmtree(folder / name, ignore_errors=True)
+        frames = _repeated(folder, name, times)
         (folder / name).mkdir()
         if name in FOLDERS:
             for t_ns, path in frames:
                 os.link(path, folder / name / f"{t_ns}.png")
         else:
             _write_video(folder / name / f"{name}.avi", frames)
+    return times
 
 
 def _render_phase(folder: Path, k: int) -> None:
@@ -110,25 +129,24 @@ def _render_phase(folder: Path, k: int) -> None:
     scene = yaml.safe_load(text)
     for name, fps in FPS.items():
         scene["cameras"][name]["fps"] = fps
-    scene["wave_s"] = phase.period_s + 1.0 if phase.is_wand else 0.0
-    scene["wand_motion"], scene["robot_motions"] = WAND_MOTION, {"rover": phase.robot_motion}
+    scene["wave_s"] = 0.0 if phase.body == ROBOT else phase.period_s + 1.0
+    scene["wand_motion"], scene["robot_motions"] = phase.motion, {ROBOT: phase.motion}
     (place / "scene.yaml").write_text(json.dumps(scene))
-    (place / "wand.yaml").write_text(example_file("wand.yaml").read_text())
-    markers = [[0.1, 0.0, 0.0], [-0.08, 0.05, 0.0], [-0.03, -0.11, 0.0]]
-    robots = {"robots": {"rover": {"diameter_m": DIAMETER_M, "markers": markers}}}
+    body = "wand.yaml" if phase.body == ROBOT else phase.body
+    (place / "wand.yaml").write_text(example_file(body).read_text())
+    robots = {"robots": {ROBOT: {"diameter_m": DIAMETER_M, "markers": MARKERS}}}
     (place / "robots.yaml").write_text(json.dumps(robots))
     render_recording(Scene.load(place / "scene.yaml"), place, 0.0, phase.period_s)
 
 
-def _repeated(folder: Path, camera: str) -> list[tuple[int, Path]]:
-    """Time (ns) and file of each frame of a camera, from the first phase to the last."""
+def _repeated(folder: Path, camera: str, times: float) -> list[tuple[int, Path]]:
+    """Time (ns) and file of each frame of a camera, from the first phase to the last, each `times` as long."""
     frames, start_s = [], 0.0
     for k, phase in enumerate(PHASES):
         paths = sorted((folder / f"phase{k}" / camera).glob("*.png"))
-        for round_ in range(round(phase.seconds / phase.period_s)):
-            shift_ns = round((start_s + round_ * phase.period_s) * 1e9)
-            frames += [(int(path.stem) + shift_ns, path) for path in paths]
-        start_s += phase.seconds
+        for _ in range(round(times * phase.seconds / phase.period_s)):
+            frames += [(int(path.stem) + round(start_s * 1e9), path) for path in paths]
+            start_s += phase.period_s
     return frames
 
 
@@ -151,6 +169,7 @@ class Operator:
 
     Args:
         page: the open page.
+        wait_for: waits until the body of an example file, or the robot, lies in the arena.
         picture: called with the name of each step that the documentation shows.
 
     Attributes:
@@ -159,8 +178,10 @@ class Operator:
 
     clicks = 0
 
-    def __init__(self, page: Page, picture: Callable[[str], object] = lambda name: None) -> None:
-        self._page, self._picture = page, picture
+    def __init__(
+        self, page: Page, wait_for: Callable[[str], object], picture: Callable[[str], object]
+    ) -> None:
+        self._page, self._wait_for, self._picture = page, wait_for, picture
 
     def check_cameras(self) -> None:
         """Wait until all cameras send, and their pictures are shown."""
@@ -186,6 +207,20 @@ class Operator:
         self._click("Accept the calibration")
         outcome = self._page.get_by_text("in force on the server")
         outcome.wait_for(timeout=STEP_MS)
+        accept.wait_for(state="hidden", timeout=STEP_MS)  # what is below moves up
+        return outcome.inner_text()
+
+    def define_floor(self) -> str:
+        """Have the L-frame define floor and origin; again while it is not on the floor yet."""
+        self._press(self._page.get_by_text("Floor and origin", exact=True))
+        self._press(self._page.locator("[role=combobox][value^=wand]"))
+        self._press(self._page.get_by_role("option", name="L-frame"))
+        self._wait_for("l.yaml")
+        self._click_until("Measure", self._page.get_by_text("the new axes"))
+        self._picture("floor")
+        self._click("Accept the new world")
+        outcome = self._page.get_by_text("the new world is")
+        outcome.wait_for(timeout=STEP_MS)
         return outcome.inner_text()
 
     def define_robot(self, name: str) -> str:
@@ -194,12 +229,8 @@ class Operator:
         label = self._page.get_by_text("Name", exact=True).and_(self._page.locator(":visible"))
         label.locator("xpath=ancestor::*[.//input][1]").locator("input").fill(name)
         outcome = self._page.get_by_text(f"the server now tracks {name}")
-        refusal = self._page.get_by_text(re.compile("no stationary|make no robot|no markers"))
-        for _ in range(60):
-            self._click("Define from everything stationary")
-            outcome.or_(refusal).first.wait_for(timeout=STEP_MS)
-            if outcome.count():
-                break
+        self._wait_for(name)
+        self._click_until("Define from everything stationary", outcome)
         self._picture("robots")
         return outcome.inner_text()
 
@@ -220,6 +251,16 @@ class Operator:
     def _click(self, name: str) -> None:
         self._press(self._button(name))
 
+    def _click_until(self, name: str, outcome: Locator) -> None:
+        """Click a button, and again if it is enabled without the outcome: something moved, or was not there yet."""
+        for _ in range(60):
+            self._click(name)
+            expect(self._button(name)).to_be_disabled(timeout=STEP_MS)  # it measures
+            outcome.or_(self._page.locator("button:enabled", has_text=name)).first.wait_for(timeout=STEP_MS)
+            if outcome.count():
+                return
+        raise AssertionError(f"{name} had no outcome")
+
     def _press(self, control: Locator) -> None:
         control.click(timeout=STEP_MS)
         self.clicks += 1
@@ -230,7 +271,7 @@ class FirstArena:
 
     Args:
         network: with places `SERVER` and `CAMERAS`.
-        recordings: as `render` wrote them.
+        recordings: in which `render` wrote the phases.
         folder: in which both commands run.
     """
 
@@ -240,13 +281,24 @@ class FirstArena:
         self.port = free_port()
 
     def __enter__(self) -> "FirstArena":
+        self.times = repeat(self._recordings)
         with self._stack as stack:
             folders = [self._recordings / name for name in FOLDERS]
             videos = [self._recordings / name / f"{name}.avi" for name in VIDEOS]
             self.up = self._start(SERVER, stack, "up", "lab", "--port", self.port, "--source", *folders)
             self.camera = self._start(CAMERAS, stack, "camera", "--source", *videos)
             self._stack = stack.pop_all()
+        self._started_s = time.monotonic()
         return self
+
+    def begin_s(self, k: int) -> float:
+        """When a phase begins, seconds after the recordings."""
+        return self.times * sum(phase.seconds for phase in PHASES[:k])
+
+    def wait_for_body(self, body: str) -> None:
+        """Wait until its first phase has begun, if the cameras have started within `START_S`."""
+        begin_s = self.begin_s(next(k for k, phase in enumerate(PHASES) if phase.body == body)) + START_S
+        wait_for(lambda: time.monotonic() - self._started_s > begin_s, deadline_s=begin_s)
 
     def __exit__(self, *exception: object) -> None:
         self._stack.close()
@@ -283,7 +335,7 @@ class FirstArena:
         path.write_text(code)
         program = Program(self._network.command(SERVER, [sys.executable, "-P", str(path)]), self._folder)
         try:
-            wait_for(lambda: is_enough(list(program.lines)), deadline_s=WAND_S + STANDING_S + WAIT_S)
+            wait_for(lambda: is_enough(list(program.lines)), deadline_s=self.begin_s(len(PHASES)))
         finally:
             program.stop(signal.SIGKILL)
         return program.lines
@@ -304,11 +356,13 @@ class Circle:
     """A circle through positions.
 
     Attributes:
+        centre_m: its centre, world.
         radius_m: its radius.
         rms_m: of the distances between the positions and the circle, in space.
         round_s: the time of one round.
     """
 
+    centre_m: Array
     radius_m: float
     rms_m: float
     round_s: float
@@ -325,7 +379,8 @@ def fit_circle(t_ns: Array, positions: Array) -> Circle:
     off = np.hypot(np.hypot(u - a, v - b) - radius, height)
     angle = np.unwrap(np.arctan2(v - b, u - a))
     rate = np.polyfit((t_ns - t_ns[0]) * 1e-9, angle, 1)[0]
-    return Circle(radius, float(np.sqrt(np.mean(off**2))), float(2 * np.pi / abs(rate)))
+    rms_m, round_s = float(np.sqrt(np.mean(off**2))), float(2 * np.pi / abs(rate))
+    return Circle(centre + a * axes[0] + b * axes[1], radius, rms_m, round_s)
 
 
 @dataclass(frozen=True)
@@ -356,10 +411,12 @@ def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]
         picture: called with the page and the name of each step that the documentation shows.
     """
     with arena.browsing() as page:
-        operator = Operator(page, lambda name: picture(page, name))
+        picture(page, "begin")
+        operator = Operator(page, arena.wait_for_body, lambda name: picture(page, name))
         operator.check_cameras()
         calibration = operator.calibrate()
-        operator.define_robot("rover")
+        operator.define_floor()
+        operator.define_robot(ROBOT)
         code = operator.program()
         lines = arena.run_program(code, lambda lines: len(driven(*read_poses(lines))[0]) > N_POSES)
         t_ns, positions = driven(*read_poses(lines))

@@ -4,20 +4,22 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from tests.benchmarks.faults.network import Namespaces, why_not
 from tests.web.browser import CHROMIUM
-from tests.web.roundel.first_arena import CAMERAS, FPS, RADIUS_M, ROUND_S, FirstArena, play, render
+from tests.web.roundel.first_arena import CAMERAS, CENTRE_M, FPS, RADIUS_M, ROUND_S, FirstArena, play, render
 
 
 @pytest.mark.slow  # the recording lasts three minutes
 def test_from_unknown_cameras_to_poses_with_two_commands_and_the_page(tmp_path: Path):
     """The server with two cameras, and two cameras on another machine, which finds the server by scouting.
 
-    The robot drives on a circle whose radius and duration the poses show. The largest error that the calibration states
-    bounds the radius; the distances of single poses from the circle have noise of their own, half a pixel.
+    The robot drives on a circle whose radius, duration and place in the world of the L-frame the poses show. The
+    largest error that the calibration states bounds the radius; the distances of single poses from the circle have
+    noise of their own, half a pixel.
     """
     if CHROMIUM is None:
         pytest.skip("chromium is not installed; apt-get install chromium")
@@ -30,6 +32,8 @@ def test_from_unknown_cameras_to_poses_with_two_commands_and_the_page(tmp_path: 
         assert arena.up.stop() == 0
     assert re.search("found arena 'arena' at tcp/", arena.camera.text)
     assert abs(outcome.circle.radius_m - RADIUS_M) < 1e-3 * outcome.expected_mm
+    # The L-frame's roundels, which fix the origin, have the same errors as the robot's.
+    assert np.linalg.norm(outcome.circle.centre_m - CENTRE_M) < 2e-3 * outcome.expected_mm
     assert outcome.circle.rms_m < 1e-3 * (outcome.expected_mm + PIXEL_MM / 2)
     assert abs(outcome.circle.round_s - ROUND_S) < 0.01 * ROUND_S
     lab = tmp_path / "lab"
