@@ -21,7 +21,6 @@ constexpr double kNarrow = 1.25;
 constexpr double kNarrowBlurs = 1.5;
 constexpr double kWide = 2.5;
 constexpr double kWideBlurs = 2.5;
-constexpr double kMinCardStep = 0.2;  // of the contrast: a smaller step from card to ground is not fitted
 
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
@@ -80,7 +79,6 @@ constexpr double kPlateauVariance = 2;   // factor from that of the residuals at
 // 4. The print
 constexpr double kMaxChance = 3;  // standard deviations: of the print, and of the levels far from the edges
 constexpr double kOtherPrint = 0.1;  // difference of ratios of another print, however uncertain the ratio is
-constexpr double kFirstOrder = 0.5;  // share of an expected curvature's effect that the first order may miss
 
 /// The fields that a fit contains or tests its residuals for.
 struct FieldEstimate {
@@ -528,7 +526,7 @@ Parameters PhotometricFitter::effect_of_curvature(double curvature) const {
 
 void PhotometricFitter::expect_curvature(const ToneRemainder* tone, double sigma) {
     tone_.expected = tone_.seen = tone ? tone->curvature(p_[kDark], p_[kBright]) : 0;
-    tone_.sigma = std::hypot(sigma, kFirstOrder * tone_.expected);
+    tone_.sigma = std::hypot(sigma, tone_.expected);
     const Parameters bent = effect_of_curvature(tone_.sigma);
     for (int i = 0; i < kPoseCount; ++i) tone_.deviation[i] = bent[kX + i] / noise_;
 }

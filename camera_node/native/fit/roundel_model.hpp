@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <array>
+#include <numbers>
 
 #include "numeric/cholesky.hpp"
 #include "numeric/ellipse.hpp"
@@ -16,6 +17,7 @@ namespace roundel {
 /// The pose is last, so that its covariance follows from the last block of a Cholesky factor.
 enum Parameter { kBright, kDark, kGround, kBlur, kRatio, kCard, kX, kY, kAxx, kAxy, kAyy, kGx, kGy };
 constexpr double kCardRatio = 9.0 / 7;  // card over outer diameter, if it is not fitted
+constexpr double kMinCardStep = 0.2;    // of the contrast: a smaller step from card to ground does not show
 constexpr int kCount = kGy + 1, kPoseCount = kCount - kX;
 using Parameters = Vector<kCount>;
 
@@ -99,10 +101,10 @@ class ModelOf {
         drop_ = float(p[kGround] - p[kBright]);
         zgx_ = float(xx * p[kGx] + xy * p[kGy]);
         zgy_ = float(xy * p[kGx] + yy * p[kGy]);
-        turn_ = float((yy * yy - xx * xx) * kRootHalf);
-        shear_ = float(xy * (xx + yy) * kRootHalf);
+        turn_ = float((yy * yy - xx * xx) / std::numbers::sqrt2);
+        shear_ = float(xy * (xx + yy) / std::numbers::sqrt2);
         per_blur_ = float(1 / blur);
-        peak_ = float(-kPeak / blur);
+        peak_ = float(-std::numbers::inv_sqrtpi / (std::numbers::sqrt2 * blur));
         half_bend_ = float(blur / (2 * det * det));
         half_flat_ = float(1.5 * blur);
         if constexpr (kAlone) {
@@ -135,8 +137,6 @@ class ModelOf {
 
   private:
     static constexpr bool kAlone = edge != kAnyEdge;
-    static constexpr double kRootHalf = 0.70710678;  // sqrt(1/2)
-    static constexpr double kPeak = 0.39894228;      // 1 / sqrt(2 pi)
 
     /// The geometry of pixels: q = A^-1 (x - c), f = |X|, n the direction of grad f, distance over f, the
     /// shift of an edge of radius 1 by blur, and the derivative of the distance by g . q.

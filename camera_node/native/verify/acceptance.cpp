@@ -20,17 +20,13 @@ constexpr double kMaxRaggedGrowth = 1.5;  // for smoothed ones
 constexpr double kMaxOffset = 0.15;       // pixels: RMS displacement of an edge around its ellipse
 constexpr double kChance = 2;             // times the displacement that noise alone makes
 constexpr double kHardBlur = 0.35;        // pixels: sharper edges were drawn to whole pixels
-constexpr double kSameLevel = 0.2;        // of the contrast: the ground is as bright as the card
 constexpr double kMinCard = 1.1;          // outer diameters: least diameter of a card whose edge shows
 constexpr double kProcessing = 0.5;       // share of a misfit that may be common to a whole edge
 constexpr double kMaxProcessing = 0.1;    // of the contrast: residuals that processing may make
-constexpr double kClippedEdge = 0.4;      // blurs by which the edge of clipped paper may be displaced
 // A ring of fewer pixels than this shows the product of its width and its contrast, whose factors hardly
 // differ from those of a thinner and darker ring: its ink must be black.
 constexpr double kThinRing = 3.6;
-constexpr double kBlackInk = 0.7;  // share of the paper's level below which ink is black
-// Residuals of a sector, over the contrast, from which a part of a refused ring counts as covered.
-constexpr double kHidden = 0.3;
+constexpr double kBlackInk = 0.7;      // share of the paper's level below which ink is black
 constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of uneven light may leave
 constexpr double kLarge = 160;         // pixels: bends of 5 % are fitted up to this size
 constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
@@ -57,7 +53,7 @@ bool has_levels(const ImageView& image, const RoundelFit& fit) {
 /// Whether white surrounds the ring, as on a card. Otherwise any dark disc with a light spot would pass.
 bool has_card(const RoundelFit& fit) {
     const double off = std::abs(fit.p[kGround] - fit.bright);
-    return fit.p[kCard] > kMinCard || off < kSameLevel * fit.contrast();
+    return fit.p[kCard] > kMinCard || off < kMinCardStep * fit.contrast();
 }
 
 /// Whether both edges follow their ellipses. The width of a letter's stroke varies around the letter; that of
@@ -113,11 +109,10 @@ double likely_edge_noise(const AcceptanceContext& context, const EdgeMisfit& mis
 
 /// Widens the claim on the size by what the noise does not explain of the residuals: a displacement of the
 /// whole edge that processing makes (sharpening, denoising, compression) does not show in the scatter of the
-/// pixels. The edge of clipped paper is where light that the camera cannot show begins.
+/// pixels.
 void claim_misfit(RoundelFit& fit, double noise) {
     const double excess = std::sqrt(std::max(0.0, square(fit.edge_residual) - square(noise)));
-    const double share = std::hypot(kProcessing * excess / fit.contrast(), fit.clipped ? kClippedEdge : 0);
-    const double displacement = share * fit.blur;
+    const double displacement = kProcessing * excess / fit.contrast() * fit.blur;
     for (const int i : {2, 4})  // Axx and Ayy
         for (const int j : {2, 4}) fit.pose_cov[size_t(i)][size_t(j)] += square(displacement);
 }
@@ -204,7 +199,7 @@ bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {
 std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fit,
                                     const AcceptanceContext& context) {
     const EdgeMisfit misfit(image, fit.p, fit.fields);
-    const OcclusionMask hidden = misfit.occlusion(context.noise, kHidden * fit.contrast());
+    const OcclusionMask hidden = misfit.occlusion(context.noise, kWrongLevel * fit.contrast());
     const bool covered = hidden.any();
     const auto failure = first_failure(image, fit, context, {kMisfit, kMaxGrowth});
     // A cover biases ratio, card, residuals and levels, but neither contrast nor size.

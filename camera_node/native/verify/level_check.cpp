@@ -22,7 +22,7 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
             const double level = fit.fields.even_level(double(x), double(y), double(levels[k]));
             const double share = (level - fit.dark) / contrast;  // 0 is ink, 1 is paper
             ++samples.total;
-            samples.wrong += std::abs(share - (dark ? 0 : 1)) > 0.3;
+            samples.wrong += std::abs(share - (dark ? 0 : 1)) > kWrongLevel;
         }
     };
     for (const double share : {0.25, 0.5, 0.75})

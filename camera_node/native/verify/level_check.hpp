@@ -5,8 +5,10 @@
 
 namespace roundel {
 
+constexpr double kWrongLevel = 0.3;  // of the contrast: a level that is neither noise nor uneven paper
+
 /// Numbers of samples in the ring, which is dark, and in the hole, which is bright: all, and those whose
-/// level is wrong by more than 0.3 of the contrast.
+/// level is wrong.
 struct LevelSamples {
     int total = 0, wrong = 0;
 };

@@ -9,6 +9,7 @@
 #include "fit/roundel_limits.hpp"
 #include "numeric/ray.hpp"
 #include "verify/learning.hpp"
+#include "verify/level_check.hpp"
 #include "verify/print_ratios.hpp"
 
 namespace roundel {
@@ -26,16 +27,13 @@ constexpr int kMaxMasked = 26;            // sectors of 32, of one edge
 constexpr int kMaxMaskedOfBoth = 44;      // sectors of 64, of both edges
 constexpr double kMaxRatioError = 0.01;   // from the nearest print, beside its uncertainty: shows a bias
 constexpr double kMaxRatioSigma = 0.005;  // of that uncertainty
-constexpr double kMaxTone = 1.2;          // curvature of a tone curve that is not known: twice its spread
 constexpr double kMinNew = 16;            // pixels: smaller new ones contain too little information
 
 // Levels in units of the contrast, from ink (0) to paper (1):
 constexpr double kForeign = 0.05;       // difference of a level that is neither of them
 constexpr double kForeignSigmas = 3.5;  // the same in standard deviations
 constexpr double kThinInk = 0.12;       // of a thin stroke
-constexpr double kBright = 0.3;         // of a place in the ring without ink, allowed
-constexpr int kMaxBright = 2;           // in so many unmasked sectors
-constexpr double kNotPaper = 0.3;       // difference from paper
+constexpr int kMaxBright = 2;           // unmasked sectors of the ring without ink
 
 constexpr double kRim = 1.06;  // outer radii: ink there continues the ring
 constexpr int kBlurred = 4;    // sectors of a run that the blurred edge of an occluding object can mask
@@ -88,7 +86,7 @@ bool has_round_card(const SectorView& view) {
     std::array<int, kSteps> ends{};
     for (int k = 0; k < kSteps; ++k) {
         const Sectors beyond = paper & view.find(kFirstRadius + k * kStep, [](double level) {
-            return std::abs(level - 1) > kNotPaper;
+            return std::abs(level - 1) > kWrongLevel;
         });
         ends[size_t(k)] = count_sectors(beyond);
         paper &= ~beyond;
@@ -105,7 +103,7 @@ bool is_letter(const SectorView& view, const RoundelFit& fit, const OcclusionMas
     Sectors bright = 0;
     for (const double share : {0.25, 0.5, 0.75})
         bright |=
-            view.find(fit.ratio + share * (1 - fit.ratio), [](double level) { return level > kBright; });
+            view.find(fit.ratio + share * (1 - fit.ratio), [](double level) { return level > kWrongLevel; });
     if (count_sectors(bright & ~masked) > kMaxBright) return true;
     Sectors inked = 0;
     for (const double radius : {0.8 * fit.ratio, kRim, 1.12, 1.2})
@@ -181,7 +179,7 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
     if (input.known) return fit;
     if (hides_inner_edge_only(guess.occlusion)) return std::nullopt;
     fit.provisional = !input.knows_camera;
-    const double tone = fit.provisional ? kMaxTone * ratio_by_curvature(fit, fit.ratio) : 0;
+    const double tone = fit.provisional ? 2 * kCurvaturePrior * ratio_by_curvature(fit, fit.ratio) : 0;
     return is_certain_roundel(image, fit, guess, input.noise, tone) ? std::optional(fit) : std::nullopt;
 }
 

@@ -11,10 +11,9 @@ namespace roundel {
 
 namespace {
 
-constexpr double kModelSigma = 0.003;    // of the print and of the model, common to all views of a roundel
-constexpr double kSecondOrder = 0.1;     // share of the tone curve's effect that the model leaves out
-constexpr double kCurvaturePrior = 0.6;  // standard deviation; 0.7 is a gamma of 2.2
-constexpr double kSameKind = 0.04;       // difference of ratios from the regression
+constexpr double kModelSigma = 0.003;  // of the print and of the model, common to all views of a roundel
+constexpr double kSecondOrder = 0.1;   // share of the tone curve's effect that the model leaves out
+constexpr double kSameKind = 0.04;     // difference of ratios from the regression
 constexpr size_t kMaxKinds = 8;
 constexpr int kMaxCount = 512;     // measurements that a regression remembers
 constexpr double kMinZoom = 0.05;  // relative change of the distance after which a roundel counts again
