@@ -19,6 +19,7 @@ from fusion.export.pose_formats import (
     write_tum,
 )
 from fusion.export.recorded_poses import RecordedPoses
+from fusion.recordings.recording_files import say_skipped
 
 WRITERS = {
     "csv": write_csv,
@@ -60,8 +61,7 @@ def export(
         raise ConfigError(f"{out} exists; give another name, or --force to replace it")
     poses = RecordedPoses(recording, robots)
     files = _write(chosen, poses, out, rate_hz)
-    for reason, count in sorted(poses.faults.items()):
-        say(f"skipped: {count} {reason}")
+    say_skipped(poses.faults)
     for robot, count in sorted(poses.counts.items()):
         say(f"{count:7} poses of {robot}")
     for file in files:

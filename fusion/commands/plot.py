@@ -12,6 +12,7 @@ from fusion.export.plots import (
     read_curves,
     write_figure,
 )
+from fusion.recordings.recording_files import say_skipped
 
 
 def plot(
@@ -36,10 +37,12 @@ def plot(
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another name by --out, or --force to replace it")
     curves = read_curves(recording, robots)
+    say_skipped(curves.faults)
     if compare is None:
         write_figure(draw_recording(curves), out)
     else:
         other = read_curves(compare, robots)
+        say_skipped(other.faults)
         for name, _, distances in compare_positions(curves, other):
             finite = distances[distances == distances]
             say(f"{name}: {(finite**2).mean() ** 0.5:.3f} mm RMS apart, {finite.max():.3f} mm at most")

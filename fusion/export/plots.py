@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Draws a recording: trajectories, positions with their uncertainty, and the residuals of each camera."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,12 +64,14 @@ class RecordedCurves:
         robots: rows of x, y, z (m) and their standard deviations (m) by robot; NaN while the robot is lost.
         residuals: rows of the RMS reprojection error (px) by camera, once a second.
         cameras: of the rig that was recorded last.
+        faults: what was skipped, counted by reason.
     """
 
     path: Path
     robots: dict[str, Curve] = field(default_factory=dict)
     residuals: dict[str, Curve] = field(default_factory=dict)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    faults: Counter[str] = field(default_factory=Counter)
 
     @property
     def colours(self) -> dict[str, str]:
@@ -91,7 +94,8 @@ def read_curves(path: Path, robots: Sequence[str] = ()) -> RecordedCurves:
     Raises:
         ConfigError: the file is missing or no recording, or holds no poses of these robots.
     """
-    curves, poses = RecordedCurves(path), RecordedPoses(path, robots)
+    poses = RecordedPoses(path, robots)
+    curves = RecordedCurves(path, faults=poses.faults)
     for pose in poses:
         curves.robots.setdefault(pose.robot, Curve()).add(pose.t_ns, _row(pose))
     curves.cameras = poses.cameras

@@ -141,6 +141,12 @@ class ArenaRecording:
             self.faults[f"undecodable messages on {key}"] += 1
 
 
+def skipped(faults: Counter[str]) -> str:
+    """What was skipped, for an error about what was not found; empty where nothing was."""
+    reasons = ", ".join(f"{count} {reason}" for reason, count in faults.most_common())
+    return f" (skipped: {reasons})" if reasons else ""
+
+
 def read_recording(path: Path) -> ArenaRecording:
     """Read what a recording says of its arena, and count its messages; of a truncated one, everything before its end.
 

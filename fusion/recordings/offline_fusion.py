@@ -26,7 +26,7 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot, load_robots
 from fusion.protocol.pose_messages import FusedFrames
-from fusion.recordings.arena_recording import DETECTIONS, ArenaRecording
+from fusion.recordings.arena_recording import DETECTIONS, ArenaRecording, skipped
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Refusal, admit
 from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult
@@ -169,10 +169,7 @@ def _fuse(
             summary.add_correction(correction, frame_set.t_ns)
     summary.not_acquired = tracker.not_acquired()
     if not summary.frame_sets:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in summary.faults.most_common())
-        raise FusionError(
-            f"no frame could be used{f' (skipped: {reasons})' if reasons else ''}; nothing was written"
-        )
+        raise FusionError(f"no frame could be used{skipped(summary.faults)}; nothing was written")
     if smoother is not None:
         yield from smoother.finish()
 
@@ -284,7 +281,7 @@ def cameras_of(recording: ArenaRecording, path: Path, rig: Path | None) -> dict[
     if rig is not None:
         return load_rig(rig).require_placed(rig)
     if recording.rig is None:
-        raise ConfigError(f"{path} holds no rig; give --rig rig.yaml")
+        raise ConfigError(f"{path} holds no rig{skipped(recording.faults)}; give --rig rig.yaml")
     return recording.rig.placed()
 
 
@@ -295,7 +292,7 @@ def robots_of(recording: ArenaRecording, path: Path, robots: Path | None) -> dic
         ConfigError, FusionError: there are none, or they can't be tracked.
     """
     if robots is None and not recording.robots:
-        raise ConfigError(f"{path} holds no robots; give --robots robots.yaml")
+        raise ConfigError(f"{path} holds no robots{skipped(recording.faults)}; give --robots robots.yaml")
     return load_robots(robots) if robots else recording.robots
 
 

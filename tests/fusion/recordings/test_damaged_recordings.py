@@ -129,6 +129,7 @@ def test_a_damaged_recording_of_an_arena_is_used_and_described(tmp_path: Path):
         ["fusion", "replay", path, "--out", tmp_path / "poses.csv"],
         ["fusion", "trim", path, tmp_path / "part.mcap"],
         ["fusion", "export", path, tmp_path / "part.csv"],
+        ["fusion", "plot", path, "--out", tmp_path / "part.png"],
         ["fusion", "repair", path, "--out", tmp_path / "repaired.mcap"],
         ["fusion", "repair", tmp_path / "repaired.mcap"],
         ["fusion", "replay", tmp_path / "repaired.mcap", "--out", tmp_path / "again.mcap"],
@@ -142,6 +143,14 @@ def test_a_damaged_recording_of_an_arena_is_used_and_described(tmp_path: Path):
         f"is complete: {len(found)} messages"
         in run_program("fusion", "repair", tmp_path / "part.mcap").stdout
     )
+
+
+def test_a_rig_in_a_damaged_part_is_missed_with_the_damage(tmp_path: Path):
+    """Before: the error advised another rig, and said nothing of the damage."""
+    done = run_program("fusion", "replay", damaged_sample(tmp_path, at=0), "--out", tmp_path / "poses.csv")
+    assert done.returncode == 2
+    assert "holds no rig (skipped: " in done.stderr
+    assert "1 damaged part" in done.stderr
 
 
 def test_a_strict_reader_refuses_a_damaged_recording(tmp_path: Path):
