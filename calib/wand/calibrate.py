@@ -38,7 +38,7 @@ from calib.wand.detections import (
     count_frames,
     gather_background,
 )
-from calib.wand.focal_lengths import has_unknown, with_rough_focal_lengths
+from calib.wand.focal_lengths import with_rough_focal_lengths
 from calib.wand.initial_rig import (
     InitialRig,
     TwoViewGeometry,
@@ -140,11 +140,13 @@ def _calibrate_by_any_clocks(
 
 @dataclass(frozen=True, slots=True)
 class _Recorded:
-    """A recording, points beside the wand, and whether its user declares it synchronous."""
+    """A recording, points beside the wand, whether its user declares it synchronous, and whether its clocks are
+    aligned by the motion."""
 
     messages: Sequence[Detections]
     background: Sequence[Detections]
     synchronous: bool
+    aligned: bool = False
 
 
 def _suspects_clocks(result: WandCalibration) -> bool:
@@ -169,7 +171,7 @@ def _calibrate_aligned(
             f"the cameras are declared synchronous, but of {alignment.sentence()}; leave out --synchronised: then the "
             "offsets are estimated"
         )
-    aligned = _Recorded(alignment.apply(given.messages), alignment.apply(given.background), False)
+    aligned = _Recorded(alignment.apply(given.messages), alignment.apply(given.background), False, aligned=True)
     try:
         result = _calibrate(rig, wand, aligned, distance)
     except CalibrationError as error:
@@ -200,7 +202,8 @@ def _calibrate_from(rig: Rig, wand: Body, given: _Recorded, distance: Distance |
     start_ns = min(message.t_ns for message in messages)
     lenses = [rig.cameras[name] for name in recording.names]
     beside = gather_background(background, recording.names, lenses, start_ns)
-    recording = replace(recording, background=beside)
+    own = replace(recording.timing, aligned=given.aligned)
+    recording = replace(recording, background=beside, timing=own)
     if not len(recording.detections):
         raise CalibrationError(_explain_no_wand(recording))
     check_motion(recording.detections, recording.names, recording.lenses)
@@ -433,7 +436,7 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
     check_clocks(recording.names, coarse)
     coarse = inflate_covariance(coarse)
     check_mirrored(recording.wand, coarse)
-    clocks = choose_clocks(coarse)
+    clocks = choose_clocks(coarse, recording.timing)
     fine = _prepare_fine(recording, rough, coarse, clocks)
     solution = _adjust_finely(fine, coarse.inflation)
     check_agreement(recording.names, solution.adjusted, solution.observations)
@@ -502,12 +505,8 @@ def _prepare_fine(
 
 
 def _adjust_finely(fine: Estimate, inflation: float) -> Solution:
-    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these.
-
-    With unknown lenses the start is kept: the optimum of path and lenses together may be far away.
-    """
-    is_rough = has_unknown(fine.problem.lenses)
-    first = adjust(fine.problem, fine.observations, fine.state, rounds=1, profiled=is_rough)
+    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these."""
+    first = adjust(fine.problem, fine.observations, fine.state, rounds=1, profiled=True)
     problem = estimate_lens_priors(fine.problem, replace(first, inflation=inflation))
     return Solution(adjust(problem, fine.observations, first.state, profiled=True), fine.observations)
 

@@ -66,11 +66,11 @@ def clock_candidates(timing: Timing, problem: Problem) -> tuple[tuple[int, ...],
     return (OFFSET, DRIFT) if np.ptp(problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
 
 
-def choose_clocks(adjusted: Adjusted) -> ClockModel:
-    """Which of the free clock parameters the recording shows. With an offset, the drift is free too: a clock that runs
-    on its own drifts, though a short recording may not show it."""
+def choose_clocks(adjusted: Adjusted, timing: Timing) -> ClockModel:
+    """Which of the free clock parameters the recording shows: all, where clocks were aligned by the motion. With an
+    offset, the drift is free too: a clock that runs on its own drifts, though a short recording may not show it."""
     candidates = tuple(group for group in (OFFSET, DRIFT) if group[0] in adjusted.problem.free)
-    shown = tuple(group for group in candidates if _differ(adjusted, group))
+    shown = tuple(group for group in candidates if timing.aligned or _differ(adjusted, group))
     free = candidates if OFFSET in shown else shown
     clocks = np.where([OFFSET in shown, DRIFT in shown, True], adjusted.state.clocks, 0.0)
     rolling = (READOUT,) if READOUT[0] in adjusted.problem.free else ()

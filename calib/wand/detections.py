@@ -221,10 +221,12 @@ class Timing:
         period_s: median time between the frames of a camera; 0 if unknown.
         synchronous: frames with equal stamps are simultaneous; all others are unrelated, so neither clocks nor the
             motion of the wand matter. Otherwise stamps may be offset, and tracks are interpolated in time.
+        aligned: the motion showed that the clocks differ, and stamps are corrected by what it shows.
     """
 
     period_s: float
     synchronous: bool = False
+    aligned: bool = False
 
     @property
     def gap_s(self) -> float:

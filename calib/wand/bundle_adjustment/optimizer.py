@@ -47,9 +47,10 @@ MAX_ITERATIONS, MAX_ROUNDS = 60, 5
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e6
 # The last step decreases the cost by less than this share, and this absolute amount.
 ROBUST_TOLERANCE, TOLERANCE, ABSOLUTE_TOLERANCE = 5e-3, 1e-4, 1e-4
-# Profiled steps end after one shorter than a standard deviation, over all parameters: the next would be a tenth of it.
-# None increases the cost by more than this factor; a step that does is halved.
-MAX_PROFILED_STEPS, PROFILED_TOLERANCE = 15, 1.0
+# Profiled steps end where those that remain, a geometric series, are this many standard deviations together, over all
+# parameters: the square of all errors grows by a tenth. None increases the cost by more than MAX_GROWTH; a step that
+# does is halved.
+MAX_PROFILED_STEPS, PROFILED_TOLERANCE = 30, 0.3
 MAX_GROWTH, MAX_HALVINGS = 10.0, 5
 # Information that fixes the gauge at the first camera and its clock: about the information of the observations. Readout
 # times and lenses are no part of the gauge.
@@ -229,7 +230,7 @@ def _levenberg_marquardt(objective: _Objective, state: State, robust: bool) -> t
 def _profile(objective: _Objective, state: State) -> State | None:
     """The state at which the cameras fit the observations best, with the motion that is optimal for these cameras, by
     Gauss-Newton; None where it does not converge."""
-    norms = objective.norms(state)
+    norms, before = objective.norms(state), 1.0
     for _ in range(MAX_PROFILED_STEPS):
         try:
             steps = profile_motion(objective.linearize(state, norms)).step(objective.problem, state)
@@ -239,8 +240,9 @@ def _profile(objective: _Objective, state: State) -> State | None:
         if stepped is None:
             return None
         state, norms = stepped
-        if steps[2] < PROFILED_TOLERANCE:
+        if steps[2] ** 2 < PROFILED_TOLERANCE * (before - steps[2]):
             return state
+        before = min(steps[2], 1.0)
     return None
 
 
@@ -300,11 +302,11 @@ class ProfiledMotion:
     motion_step: Array
 
     def step(self, problem: Problem, state: State) -> tuple[Array, Array, float]:
-        """The Gauss-Newton step, (C, 18) of the cameras and (K, h) of the motion, and how far it is: the square of its
+        """The Gauss-Newton step, (C, 18) of the cameras and (K, h) of the motion, and how far it is: its
         Mahalanobis length in the cameras."""
         of_cameras = invert_information(problem, state, self.information) @ self.gradient
         motion_step = self.motion_step - self.response @ of_cameras
-        return _all_parameters(problem, of_cameras), motion_step, float(of_cameras @ self.gradient)
+        return _all_parameters(problem, of_cameras), motion_step, float(np.sqrt(abs(of_cameras @ self.gradient)))
 
 
 def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
@@ -370,27 +372,37 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     """Eliminate the motion.
 
     With H the Hessian, g the gradient and P the Hessian of the motion prior, the response of the motion is
-    G = H_mm^-1 H_mc, and the derivatives of the observations by the cameras, along the optimal motion, are J_c - J_m G.
-    Their information is H_cc - G^T (H_mc + P G), and their score J_c^T r - G^T J_m^T r.
+    G = H_mm^-1 H_mc, and the derivatives of the observations by the cameras, along the optimal motion, are
+    D = J_c - J_m G. A smooth path is shorter than the true one, and cameras that make it longer fit better. So the
+    residuals r are fitted once more, r - J_m H_mm^-1 J_m^T r, before they are compared with D (twicing: Newey, Hsieh
+    and Robins, Econometrica 72, 2004). With J_m^T D = P G the score is D^T r - (P G)^T H_mm^-1 J_m^T r, and the
+    information H_cc - G^T (H_mc + P G) - (P G)^T H_mm^-1 P G.
 
     Raises:
         LinAlgError: the motion's Hessian is not positive definite.
     """
     sums, prior = _Sums.of(system), system.motion_prior[:, :-1, :-1]
-    h, size = sums.gradient.shape[1], len(sums.of_cameras)
+    (knots, h), size = sums.gradient.shape, len(sums.of_cameras)
     motion = sums.motion.factorize()
-    G = motion.solve(sums.crossed)
-    along = (sums.crossed + BlockTridiagonal.of_chain(prior).multiply(G)).reshape(-1, size)
-    observed = sums.observed
+    observed = np.zeros((knots, h))
+    observed[:-1] += sums.observed[:, :h]
+    observed[1:] += sums.observed[:, h:]
+    right = np.concatenate([sums.crossed, observed[:, :, None], sums.gradient[:, :, None]], axis=2)
+    G, again, motion_step = np.split(motion.solve(right), [size, size + 1], axis=2)
+    by_prior = BlockTridiagonal.of_chain(prior).multiply(G)
+    along, twice = (sums.crossed + by_prior).reshape(-1, size), motion.solve(by_prior).reshape(-1, size)
+    # By interval: the prior of each moves the paths of both its knots.
+    pulled = sums.observed + (prior @ np.concatenate([again[:-1], again[1:]], axis=1))[:, :, 0]
     scores = sums.scores.copy()
-    scores[: len(observed)] -= (observed[:, None, :h] @ G[:-1] + observed[:, None, h:] @ G[1:])[:, 0]
+    scores[: len(pulled)] -= (pulled[:, None, :h] @ G[:-1] + pulled[:, None, h:] @ G[1:])[:, 0]
+    information = sums.of_cameras - G.reshape(-1, size).T @ along - by_prior.reshape(-1, size).T @ twice
     by_priors, gradient = _prior_equations(system)
     return ProfiledMotion(
-        information=sums.of_cameras + by_priors - G.reshape(-1, size).T @ along,
+        information=information + by_priors,
         scores=scores,
         gradient=scores.sum(axis=0) + gradient,
         response=G,
-        motion_step=motion.solve(sums.gradient[:, :, None])[:, :, 0],
+        motion_step=motion_step[:, :, 0],
     )
 
 
