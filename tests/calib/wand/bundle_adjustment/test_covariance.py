@@ -55,7 +55,7 @@ def test_halves_agree_within_their_covariance(correlated: bool, expected: float,
     to chance.
 
     Blocks of 1 s see a part of errors with periods up to 4 s: standard deviations are right within a factor of 2;
-    without inflation they are too small by more than 3.5, although adjusted lenses absorb some of these errors.
+    without inflation they are too small by more than 3, although adjusted lenses absorb some of these errors.
     """
     arena, chi2, degrees, plain, factors = ring(3), 0.0, 0, 0.0, []
     for seed in range(seeds):
@@ -66,7 +66,7 @@ def test_halves_agree_within_their_covariance(correlated: bool, expected: float,
         plain, factors = plain + agreement.chi2 * factor, [*factors, factor]
     if correlated:
         assert np.mean(factors) > expected
-        assert plain / degrees > 3.5**2
+        assert plain / degrees > 3.0**2  # the inflation is needed: more than the 2 that it leaves
         assert chi2 / degrees < 2.0**2
     else:
         assert np.mean(factors) == pytest.approx(expected, abs=0.15)
