@@ -171,7 +171,9 @@ def _calibrate_aligned(
             f"the cameras are declared synchronous, but of {alignment.sentence()}; leave out --synchronised: then the "
             "offsets are estimated"
         )
-    aligned = _Recorded(alignment.apply(given.messages), alignment.apply(given.background), False, aligned=True)
+    aligned = _Recorded(
+        alignment.apply(given.messages), alignment.apply(given.background), False, aligned=True
+    )
     try:
         result = _calibrate(rig, wand, aligned, distance)
     except CalibrationError as error:

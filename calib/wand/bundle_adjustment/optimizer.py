@@ -306,7 +306,11 @@ class ProfiledMotion:
         Mahalanobis length in the cameras."""
         of_cameras = invert_information(problem, state, self.information) @ self.gradient
         motion_step = self.motion_step - self.response @ of_cameras
-        return _all_parameters(problem, of_cameras), motion_step, float(np.sqrt(abs(of_cameras @ self.gradient)))
+        return (
+            _all_parameters(problem, of_cameras),
+            motion_step,
+            float(np.sqrt(abs(of_cameras @ self.gradient))),
+        )
 
 
 def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
