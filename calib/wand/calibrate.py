@@ -38,7 +38,7 @@ from calib.wand.detections import (
     count_frames,
     gather_background,
 )
-from calib.wand.focal_lengths import with_rough_focal_lengths
+from calib.wand.focal_lengths import has_unknown, with_rough_focal_lengths
 from calib.wand.initial_rig import (
     InitialRig,
     TwoViewGeometry,
@@ -507,8 +507,12 @@ def _prepare_fine(
 
 
 def _adjust_finely(fine: Estimate, inflation: float) -> Solution:
-    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these."""
-    first = adjust(fine.problem, fine.observations, fine.state, rounds=1, profiled=True)
+    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these.
+
+    With unknown lenses the start is kept: the optimum of path and lenses together may be far away.
+    """
+    is_rough = has_unknown(fine.problem.lenses)
+    first = adjust(fine.problem, fine.observations, fine.state, rounds=1, profiled=is_rough)
     problem = estimate_lens_priors(fine.problem, replace(first, inflation=inflation))
     return Solution(adjust(problem, fine.observations, first.state, profiled=True), fine.observations)
 
