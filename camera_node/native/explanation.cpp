@@ -18,7 +18,6 @@ constexpr Print kThinnest{0.8};
 constexpr Print kThickest{0.2};
 constexpr double kMinDiameter = 6;
 constexpr double kMaxDiameter = 10000;
-constexpr double kNoiseSpan = 6;     // standard deviations: contrast of a ring that noise does not make
 constexpr double kSameCentre = 0.3;  // minor axes, for two ellipses of one ring
 constexpr double kSameSize = 1.5;    // factor, for two ellipses of one ring
 constexpr size_t kMaxCandidates = 4096;
@@ -29,7 +28,7 @@ RoundelLimits ring_limits(double noise) {
     limits.ratio_tolerance = 0.1;
     limits.min_diameter = kMinDiameter;
     limits.max_diameter = kMaxDiameter;
-    limits.min_contrast = kNoiseSpan * noise;
+    limits.min_contrast = kRingSpan * noise;
     return limits;
 }
 

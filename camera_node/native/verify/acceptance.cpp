@@ -206,7 +206,8 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
     if (failure == Refusal::kContrast || failure == Refusal::kSize || (failure && !covered)) return failure;
     if (covered) return Refusal::kCover;
     if (!has_black_ink(fit)) return Refusal::kPaleInk;
-    return has_elliptic_edges(misfit, fit, context.noise) ? std::nullopt : std::optional(Refusal::kEdges);
+    return has_elliptic_edges(misfit, fit, context.noise) ? std::nullopt
+                                                          : std::optional(Refusal::kNotElliptic);
 }
 
 /// Fits a roundel to the image as it is, or smoothed.

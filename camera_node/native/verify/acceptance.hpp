@@ -18,18 +18,20 @@ bool has_black_ink(const RoundelFit& fit);
 
 /// The test that a ring-like shape fails. The numbers are those of `camera_node.detection.refusals`.
 enum class Refusal {
-    kNoFit,      // the model of a roundel does not converge on it
-    kRatio,      // not a print's
-    kContrast,   // too low
-    kSize,       // out of limits
-    kCard,       // no white around the ring
-    kResiduals,  // too large at the edges
-    kEdges,      // not elliptic
-    kInside,     // ring or hole have places with a wrong level
-    kCover,      // a part is covered, and the rest does not suffice
-    kBullseye,   // further rings around it
-    kPaleInk     // a ring so thin that a thinner, black one may look the same
+    kNoFit,        // the model of a roundel does not converge on it
+    kRatio,        // not a print's
+    kContrast,     // too low
+    kSize,         // out of limits
+    kCard,         // no white around the ring
+    kResiduals,    // too large at the edges
+    kNotElliptic,  // an edge is no ellipse
+    kInside,       // ring or hole have places with a wrong level
+    kCover,        // a part is covered, and the rest does not suffice
+    kBullseye,     // further rings around it
+    kPaleInk       // a ring so thin that a thinner, black one may look the same
 };
+
+constexpr double kRingSpan = 6;  // standard deviations of noise: contrast of a ring that it does not make
 
 /// The limit that a fit exceeds, if any.
 std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits);

@@ -20,7 +20,7 @@ from tests.benchmarks.detector.cameras import (
     uncovered,
 )
 from tests.benchmarks.detector.models import CHANGE_CLAIM, CHANGED, faint_found, size_claims_after_change
-from tests.benchmarks.detector.pictures import sight_of
+from tests.benchmarks.detector.pictures import flat, sight_of
 from tests.benchmarks.detector.recall import SIZE
 from tests.benchmarks.detector.table import Run
 from tests.camera_node.tracing import ellipse_of
@@ -28,6 +28,7 @@ from tests.camera_node.tracing import ellipse_of
 RUN = Run("chords", Detector, False)
 MILD_SHARE = 0.8  # goal for covered roundels behind a mild camera
 CARDS = 90  # in three pictures
+NOISY = Sensor(noise=9.0, tone="gamma", bayer=True)
 FALLS_OFF = Sensor(noise=1.5, vignetting=0.3, shading=0.2)
 MIDDLE = (np.array(SIZE[::-1]) - 1) / 2
 
@@ -149,6 +150,15 @@ def test_a_camera_that_denoises_and_sharpens_is_learned():
     assert detector.tone_exponent is not None
     share = share_found(detector, HARSH, partial(covered, 0.2, True), CARDS // 30)
     assert share > goal - 4 * np.sqrt(goal * (1 - goal) / CARDS)
+
+
+@pytest.mark.parametrize("level", [2.0, 5.0])
+def test_noise_of_dark_places_makes_no_roundels(level):
+    """A tone curve amplifies it, and a colour mosaic correlates it. Once the curve was known there were 20 in four
+    frames, because noise explains all residuals of rings that are as faint as it is."""
+    detector, dark = known(NOISY), flat(SIZE, level)
+    rng = np.random.default_rng(1)
+    assert [len(detector.detect(NOISY.expose(dark, rng))) for _ in range(4)] == [0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("paper", [308.0, 410.0])
