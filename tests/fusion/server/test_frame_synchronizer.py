@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from camera_node.detection.roundels import Roundels
-from fusion.model.frames import N_ROWS, CalibratedFrame, FrameSet
+from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
+from fusion.model.undistortion import N_ROWS
 from fusion.server.frame_synchronizer import SILENT_NS, FrameSynchronizer
 
 PERIOD = 33_333_333
