@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from camera_node.detection.detector import Detector, DetectorSettings, SettingKeywords
@@ -106,13 +106,21 @@ def scenes(draw: st.DrawFn) -> tuple[list[Disc], float, float, int]:
     return discs, draw(st.floats(120, 230)), draw(st.floats(0.5, 0.9)), draw(st.integers(0, 99))
 
 
+LEAST_ALIKE = [
+    Disc(uv=(118.25, 27.234375), diameter=19.765625, tilt=0.5625, turn=6.0),
+    *(Disc(uv=uv, diameter=16.0) for uv in ((40.0, 30.0), (40.0, 90.0), (120.0, 90.0))),
+]
+
+
 @settings(max_examples=15)
 @given(scenes())
+@example((LEAST_ALIKE, 133.0, 0.75, 1))
 def test_both_detectors_agree(scene: tuple[list[Disc], float, float, int]):
     """Both find every roundel; their fits have different initial guesses and the same result.
 
-    Their difference is below one sigma (a one-step estimate does not depend on its initial guess to first order), and
-    their errors below four sigmas plus 0.02 px for rounding.
+    A one-step estimate does not depend on its initial guess to first order: their difference is below one sigma of the
+    less certain one, since each claims the correlation of its own residuals. Errors are below four sigmas plus 0.02 px
+    for rounding.
     """
     discs, bright, blur, seed = scene
     image = expose(render(discs, bright=bright, blur=blur), 2, np.random.default_rng(seed))
@@ -121,8 +129,8 @@ def test_both_detectors_agree(scene: tuple[list[Disc], float, float, int]):
     for disc in discs:
         centre = outer_conic(disc, np.array([79.5, 59.5]))[0]
         ours, theirs = (r[int(np.linalg.norm(r.uv - centre, axis=1).argmin())] for r in (by_chords, by_paper))
-        sigma = float(np.sqrt(np.trace(ours.cov) / 2))
-        assert np.abs(ours.uv - theirs.uv).max() < sigma
+        sigma, other = (float(np.sqrt(np.trace(found.cov) / 2)) for found in (ours, theirs))
+        assert np.abs(ours.uv - theirs.uv).max() < max(sigma, other)
         assert np.abs(ours.uv - centre).max() < 4 * sigma + 0.02
 
 
