@@ -294,7 +294,7 @@ bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int trac
 bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const {
     if (!fit || frame.found.size() >= kMaxRoundels) return false;
     if (frame.suppression.contains(fit->outer.x, fit->outer.y)) return false;
-    if (track < 0 && (!has_black_ink(*fit) || fit->contrast() < kRingSpan * frame.noise)) return false;
+    if (track < 0 && refusal_of_new(*fit, frame.noise)) return false;
     if (is_bullseye(frame.image, *fit, has_known_ratio(*fit, limits_))) return false;
     if (fit->provisional) {
         const auto is_same = [&](const RoundelFit& other) {

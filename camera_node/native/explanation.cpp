@@ -41,9 +41,9 @@ std::optional<RefusedRing> refuse(const ImageView& image, const InitialGuess& gu
     start.camera.prints = {};
     if (const auto accepted = fit_roundel(image, start, context, false)) {
         const bool bullseye = is_bullseye(image, *accepted, has_known_ratio(*accepted, context.limits));
-        if (!bullseye && has_black_ink(*accepted)) return std::nullopt;
-        return RefusedRing{accepted->outer, accepted->ratio, accepted->contrast(), 0,
-                           bullseye ? Refusal::kBullseye : Refusal::kPaleInk};
+        const auto reason = bullseye ? Refusal::kBullseye : refusal_of_new(*accepted, context.noise);
+        if (!reason) return std::nullopt;
+        return RefusedRing{accepted->outer, accepted->ratio, accepted->contrast(), 0, *reason};
     }
     const auto fit = fit_photometric(image, start);  // without a prior on the print
     if (!fit) return seen;

@@ -107,6 +107,11 @@ struct RoundelFit {
     bool is_explained(double image_noise, double misfit) const {
         return edge_residual < std::hypot(1.2 * image_noise, misfit * contrast());
     }
+    /// Adds a variance of the displacement of all of the outer edge, square pixels, to the claim on the size.
+    void widen_size(double variance) {
+        for (const size_t i : {2, 4})  // Axx and Ayy
+            for (const size_t j : {2, 4}) pose_cov[i][j] += variance;
+    }
     /// Covariances of the ellipse's centre and of the offset, square pixels.
     Symmetric centre_covariance() const { return {pose_cov[0][0], pose_cov[0][1], pose_cov[1][1]}; }
     Symmetric offset_covariance() const { return {pose_cov[5][5], pose_cov[5][6], pose_cov[6][6]}; }

@@ -112,9 +112,7 @@ double likely_edge_noise(const AcceptanceContext& context, const EdgeMisfit& mis
 /// pixels.
 void claim_misfit(RoundelFit& fit, double noise) {
     const double excess = std::sqrt(std::max(0.0, square(fit.edge_residual) - square(noise)));
-    const double displacement = kProcessing * excess / fit.contrast() * fit.blur;
-    for (const int i : {2, 4})  // Axx and Ayy
-        for (const int j : {2, 4}) fit.pose_cov[size_t(i)][size_t(j)] += square(displacement);
+    fit.widen_size(square(kProcessing * excess / fit.contrast() * fit.blur));
 }
 
 /// Whether a fit shows the same ring as another one that was tested: its outline is within a blur of it.
@@ -188,8 +186,15 @@ std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits
     return std::nullopt;
 }
 
-bool has_black_ink(const RoundelFit& fit) {
+/// Whether the ink is black if the ring is so thin that the picture does not tell a pale ring from a thinner
+/// one. New roundels must pass.
+static bool has_black_ink(const RoundelFit& fit) {
     return (1 - fit.ratio) * fit.outer.major / 2 >= kThinRing || fit.dark < kBlackInk * fit.bright;
+}
+
+std::optional<Refusal> refusal_of_new(const RoundelFit& fit, double noise) {
+    if (fit.contrast() < kRingSpan * noise) return Refusal::kContrast;
+    return has_black_ink(fit) ? std::nullopt : std::optional(Refusal::kPaleInk);
 }
 
 bool is_within_limits(const RoundelFit& fit, const RoundelLimits& limits) {

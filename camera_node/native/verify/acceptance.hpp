@@ -12,10 +12,6 @@ namespace roundel {
 /// Whether the ratio is that of a known print, within the tolerance.
 bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits);
 
-/// Whether the ink is black if the ring is so thin that the picture does not tell a pale ring from a thinner
-/// one. New roundels must pass.
-bool has_black_ink(const RoundelFit& fit);
-
 /// The test that a ring-like shape fails. The numbers are those of `camera_node.detection.refusals`.
 enum class Refusal {
     kNoFit,        // the model of a roundel does not converge on it
@@ -32,6 +28,10 @@ enum class Refusal {
 };
 
 constexpr double kRingSpan = 6;  // standard deviations of noise: contrast of a ring that it does not make
+
+/// The test that a fit which passes all others fails as a new roundel, if any: noise explains all residuals
+/// of a ring that is as faint as itself, and a thin ring of pale ink looks like a thinner, black one.
+std::optional<Refusal> refusal_of_new(const RoundelFit& fit, double noise);
 
 /// The limit that a fit exceeds, if any.
 std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits);

@@ -187,9 +187,7 @@ void CameraModel::claim(RoundelFit& fit) const {
     fit.pose_cov = scaled(fit.pose_cov, std::max({1.0, fit.correlation, correlation_.value()}));
     // Clipped paper hides the part of an edge that would show the tone curve: its prior stays.
     const double unknown = fit.clipped && !knows_tone_ ? square(kCurvaturePrior) : 0;
-    const double displacement = std::max(surprise_, unknown) * square(kEdgeShift * fit.blur);
-    for (const size_t i : {2, 4})  // Axx and Ayy
-        for (const size_t j : {2, 4}) fit.pose_cov[i][j] += displacement;
+    fit.widen_size(std::max(surprise_, unknown) * square(kEdgeShift * fit.blur));
     bend_.claim(fit);
 }
 
