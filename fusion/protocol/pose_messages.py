@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The server's messages over Zenoh, in the encoding of `camera_node.protocol.messages`."""
 
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from os import PathLike
@@ -361,6 +362,7 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     contradictions: tuple[Contradiction, ...] = ()  # of residuals to their claims
     unsaved_robots: tuple[str, ...] = ()  # names whose changes a restart would undo
     rig_t_ns: int | None = None  # `RigMessage.t_ns` of the rig in force; None without one
+    robots_digest: str | None = None  # `robots_digest()` of the robots in use
 
 
 def robots_key(arena: str) -> str:
@@ -392,6 +394,11 @@ class RobotsRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     ] = {}  # new robots, or with `replace` new markers of old ones, which are acquired again
     replace: bool = False  # otherwise `define` with the name of another robot is refused
     source: RequestSource | None = None
+
+
+def robots_digest(robots: dict[str, Robot]) -> str:
+    """What distinguishes robots from others: the start of the SHA-256 of their message."""
+    return hashlib.sha256(msgspec.msgpack.encode(robots, order="deterministic")).hexdigest()[:16]
 
 
 class Robots(msgspec.Struct, frozen=True, kw_only=True):

@@ -16,7 +16,7 @@ from fusion.errors import FusionError
 from fusion.model.corrections import ExtrinsicsCorrection, corrected_camera, with_errors_of
 from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import Robot
-from fusion.protocol.pose_messages import Robots, RobotsRequest
+from fusion.protocol.pose_messages import Robots, RobotsRequest, robots_digest
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.server_statistics import PipelineStatus
@@ -242,6 +242,7 @@ class TrackingPipeline:
         general = PipelineStatus(
             limits=self._config.limits,
             rig_t_ns=message.t_ns if message else None,
+            robots_digest=robots_digest(self.robots),
             not_acquired=dict.fromkeys(self.robots, NOT_CALIBRATED),
             unsaved_robots=self.active_robots.unsaved(),
         )

@@ -35,6 +35,7 @@ from fusion.protocol.pose_messages import (
     Robots,
     TrackingState,
     frames_key,
+    robots_digest,
     robots_key,
 )
 from fusion.rig_graph.rig_monitor import JudgeProcess
@@ -160,9 +161,9 @@ class Server:
             transport.declare_alive(keys.fusion_alive)
         else:
             transport.subscribe(keys.rig, self._follow_rig, _prepare_lenses)
-            transport.subscribe(keys.fusion_status, self._request_new_rig)
+            transport.subscribe(keys.fusion_status, self._request_changes)
             transport.subscribe(robots_key(keys.arena), self._follow_robots)
-            transport.watch_tokens(keys.fusion_alive, self._request_robots)
+            transport.watch_tokens(keys.fusion_alive, self._note_first_zone)
         if self.zones is not None:
             self.zones.declare(self._subscribe_frames)
 
@@ -313,12 +314,20 @@ class Server:
             self.statistics.count_fault("unusable rig")
             log.warning("the rig of the first zone is not used: %s", error)
 
-    def _request_new_rig(self, data: bytes, key: str, received_ns: int) -> None:
-        """Request the rig of the first zone's server if its status tells that it is another one."""
+    def _request_changes(self, data: bytes, key: str, received_ns: int) -> None:
+        """Request the rig and the robots of the first zone's server if its status tells that they are others."""
         with contextlib.suppress(MessageError):
-            active, t_ns = self.pipeline.active_rig.message, decode(data, FusionStatus).rig_t_ns
-            if t_ns is not None and (active is None or active.t_ns != t_ns):
-                self.transport.request(self.keys.rig, self._follow_rig, _prepare_lenses)
+            active, status = self.pipeline.active_rig.message, decode(data, FusionStatus)
+            if status.rig_t_ns is not None and (active is None or active.t_ns != status.rig_t_ns):
+                self._request_rig()
+            if status.robots_digest not in (None, robots_digest(self.pipeline.robots)):
+                self._request_robots()
+
+    def _request_rig(self) -> None:
+        self.transport.request(self.keys.rig, self._follow_rig, _prepare_lenses)
+
+    def _request_robots(self) -> None:
+        self.transport.request(robots_key(self.keys.arena), self._follow_robots)
 
     def _follow_robots(self, data: bytes, key: str, received_ns: int) -> None:
         """Use the robots of the first zone's server."""
@@ -332,11 +341,11 @@ class Server:
         else:
             self.zones.member.ownership.rename(robots.renamed)
 
-    def _request_robots(self, key: str, is_alive: bool) -> None:
+    def _note_first_zone(self, key: str, is_alive: bool) -> None:
         """Request the robots and the rig of the first zone's server once it is there."""
         if is_alive:
-            self.transport.request(robots_key(self.keys.arena), self._follow_robots)
-            self.transport.request(self.keys.rig, self._follow_rig, _prepare_lenses)
+            self._request_robots()
+            self._request_rig()
 
 
 def publish_poses(

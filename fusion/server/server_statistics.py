@@ -47,6 +47,7 @@ class PipelineStatus:
         contradictions: of residuals to their claims.
         unsaved_robots: names of the robots whose changes a restart would undo.
         rig_t_ns: since when the active rig is in force.
+        robots_digest: of the robots in use.
     """
 
     limits: Limits | None = None
@@ -60,6 +61,7 @@ class PipelineStatus:
     contradictions: tuple[Contradiction, ...] = ()
     unsaved_robots: tuple[str, ...] = ()
     rig_t_ns: int | None = None
+    robots_digest: str | None = None
 
 
 @dataclass
@@ -232,6 +234,7 @@ class ServerStatistics:
             contradictions=pipeline.contradictions,
             unsaved_robots=pipeline.unsaved_robots,
             rig_t_ns=pipeline.rig_t_ns,
+            robots_digest=pipeline.robots_digest,
         )
         self._since_ns, self._cpu_s = now_ns, cpu_s
         self._reset()

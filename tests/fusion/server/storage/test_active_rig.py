@@ -26,6 +26,7 @@ from camera_node.protocol.session import open_router
 from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
 from fusion.model.corrections import ExtrinsicsCorrection
+from fusion.protocol.pose_messages import Robots, robots_key
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
 from tests.fusion.serving import ARENA, config, connected, send_until_tracked, serving, zones_of
@@ -361,6 +362,11 @@ def test_the_server_of_another_zone_follows_the_rig_and_the_robots_of_the_first(
             client.undo_rig()
             wait_for(lambda: follower.pipeline.active_rig.rig == numbered(1))
             assert client.redo_rig().rig == FEWER, "the other server wrote no files"
+            client.session.put(robots_key("test"), encode(Robots(robots={})))
+            wait_for(lambda: follower.pipeline.robots == {})
+            wait_for(
+                lambda: list(follower.pipeline.robots) == ["b"]
+            )  # the first server's status tells of them
 
 
 def test_a_viewer_that_missed_a_publication_requests_the_rig(tmp_path: Path):
