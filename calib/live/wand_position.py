@@ -46,7 +46,7 @@ def locate_wand(cameras: Mapping[str, Camera], wand: Body, latest: Mapping[str, 
         return None
     names = sorted(message.camera for message in recent)
     lenses = [cameras[name] for name in names]
-    frames, detections = gather(recent, names, lenses)
+    frames, detections = gather(recent, names, lenses, wand.codes)
     if len(wand.markers) == 2 and not (detections.label >= 0).any():
         return _locate_two(lenses, detections, wand)
     try:

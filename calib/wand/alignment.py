@@ -109,7 +109,7 @@ def align_clocks(rig: Rig, wand: Body, messages: Sequence[Detections]) -> Alignm
     if all(m.clock_error_us > 0 for m in messages):
         return Alignment(reference_ns, {})
     names = sorted({m.camera for m in messages})
-    frames, detections = gather(messages, names, [rig.cameras[name] for name in names])
+    frames, detections = gather(messages, names, [rig.cameras[name] for name in names], wand.codes)
     frames = replace(frames, t_s=frames.t_s - (reference_ns - min(stamps)) * 1e-9)
     signals = {}
     for k, name in enumerate(names):

@@ -48,7 +48,7 @@ from calib.wand.initial_rig import (
     explain_unplaced,
     find_faults,
 )
-from calib.wand.labels import explain_wand, label_recording
+from calib.wand.labels import explain_codes, explain_wand, label_recording
 from calib.wand.quality.checks import (
     check_clocks,
     check_lenses,
@@ -116,9 +116,11 @@ def calibrate(
     given = _Recorded(messages, background, synchronous)
     try:
         return _calibrate_by_any_clocks(rig, wand, given, distance)
-    except CalibrationError:
+    except CalibrationError as error:
         if difference := explain_wand(rig, wand, messages):
             raise CalibrationError(difference) from None
+        if left_out := explain_codes(wand, messages):
+            raise CalibrationError(f"{error}; {left_out}") from None
         raise
 
 

@@ -18,6 +18,7 @@ from calib.rig.camera import Camera
 from calib.wand.trajectory import hermite
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body
+from camera_node.geometry.codes import PLAIN
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import RawEllipses
 from camera_node.protocol.messages import Detections
@@ -32,6 +33,8 @@ COLUMNS = {
     "angle_rad": ("<f4", 1),
     "id": ("<i4", 1),
 }
+UNREAD = np.array(np.nan, "<f4").tobytes()  # in the column `id_probability`: no code was read
+FOREIGN = -2  # label of a roundel with the code of another object
 MAX_GAP_PERIODS, MAX_GAP_S = 2.5, 0.5  # longest interpolation of a track: frame periods, and seconds
 MAX_SPREAD_S = 0.1  # a hand moves decimetres in this time
 MIN_SPREAD_S = (
@@ -117,12 +120,16 @@ class WandDetections:
 
 
 def gather(
-    messages: Sequence[Detections], names: Sequence[str], lenses: Sequence[Camera]
+    messages: Sequence[Detections],
+    names: Sequence[str],
+    lenses: Sequence[Camera],
+    codes: Sequence[int] = (),
 ) -> tuple[FrameTable, WandDetections]:
     """Collect the detections of the cameras `names` from their messages.
 
-    The `id` of a roundel becomes its label. Detections outside the valid area of a lens model are dropped; those a
-    little outside the image are not: a corner of a tag can be.
+    A number that another program gave is the label. A code that a detector read labels the marker that has it among
+    `codes` (`Body.codes`); a roundel with another code belongs to another object, and is dropped. So are detections
+    outside the valid area of a lens model; those a little outside the image are not: a corner of a tag can be.
     """
     index = {name: k for k, name in enumerate(names)}
     messages = sorted(messages, key=lambda message: (index[message.camera], message.t_ns))
@@ -134,6 +141,13 @@ def gather(
     frames = FrameTable(camera, (np.array(t_ns) - min(t_ns)) * 1e-9, readout_s)
     tables = [_read_column(data, *shape) for data, shape in zip(columns, COLUMNS.values(), strict=True)]
     uv, cov, axes_px, angle_rad, number = tables
+    probability = [message.id_probability or UNREAD * len(message) for message in messages]
+    is_code = np.isfinite(_read_column(probability, "<f4", 1)[:, 0])
+    marker = {code: k for k, code in enumerate(codes) if code != PLAIN}
+    label = [
+        marker.get(int(k), FOREIGN) if is_read else int(k)
+        for k, is_read in zip(number[:, 0], is_code, strict=True)
+    ]
     frame = np.repeat(np.arange(len(messages)), [len(data) // 16 for data in columns[0]])
     image_row = image_rows(lenses, camera[frame], uv)
     detections = WandDetections(
@@ -142,14 +156,15 @@ def gather(
         frames.t_s[frame] + readout_s[frame] * image_row,
         image_row,
         stamp_sigmas(camera, 1e-6 * np.array(bound_us))[frame],
-        number[:, 0].astype(np.intp),
+        np.array(label, np.intp),
         uv,
         cov[:, [0, 1, 1, 2]].reshape(-1, 2, 2),
         axes_px,
         angle_rad[:, 0],
         normalise(lenses, camera[frame], uv),
     )
-    return frames, detections.select(np.flatnonzero(np.isfinite(detections.xy).all(axis=1)))
+    usable = np.isfinite(detections.xy).all(axis=1) & (detections.label != FOREIGN)
+    return frames, detections.select(np.flatnonzero(usable))
 
 
 def image_rows(lenses: Sequence[Lens], camera: Index, uv: Array) -> Array:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Assigns the detections of a recording to the markers of the wand.
 
-Detections that carry marker numbers keep them. A wand of three or more markers is found by its spacing (`spacing`), the
-ends of a wand of two markers are distinguished over time and between cameras. Labels then propagate to frames in which
-markers are missing, from the frames before and after.
+Detections that carry marker numbers keep them, and codes are such numbers. A wand of three or more markers is found by
+its spacing (`spacing`), the ends of a wand of two markers are distinguished over time and between cameras. Labels then
+propagate to frames in which markers are missing, from the frames before and after.
 
 The ends of two markers that look alike: swapping them in all frames of all cameras changes nothing; swapping them in
 one camera does. From frame to frame of a camera the wand turns little: frames are chained into segments with one
@@ -61,7 +61,7 @@ def label_recording(
     """
     names = sorted({message.camera for message in messages})
     lenses = [rig.cameras[name] for name in names]
-    frames, detections = gather(messages, names, lenses)
+    frames, detections = gather(messages, names, lenses, wand.codes)
     timing = Timing(frames.period_s(), synchronous)
     detections, left_out = label(frames, timing, detections, wand, lenses)
     last = np.searchsorted(frames.camera, range(len(names)), side="right") - 1
@@ -83,7 +83,24 @@ def explain_wand(rig: Rig, wand: Body, messages: Sequence[Detections]) -> str:
     """How the wand of a recording differs from its file, as far as single images show it; empty if they do not."""
     names = sorted({message.camera for message in messages})
     lenses = [rig.cameras[name] for name in names]
-    return explain_spacing(wand, gather(messages, names, lenses)[1], lenses)
+    return explain_spacing(wand, gather(messages, names, lenses, wand.codes)[1], lenses)
+
+
+def explain_codes(wand: Body, messages: Sequence[Detections]) -> str:
+    """The codes in a recording that may be the wand's, although its file does not state them; empty if there are not
+    enough."""
+    read: Counter[int] = Counter()
+    for message in messages:
+        roundels = message.unpack()
+        read.update(roundels.id[np.isfinite(roundels.id_probability)].tolist())
+    markers = len(wand.markers)
+    others = sorted(code for code, _ in read.most_common(markers) if code not in wand.codes)
+    if len(others) < markers:
+        return ""
+    return (
+        f"roundels with the codes {', '.join(map(str, others))} were left out, because the wand file does not state "
+        "these; if they are the wand's, add the line code: [...] with the code of each marker"
+    )
 
 
 def label(
@@ -116,7 +133,12 @@ def _assign_labels(
     reason = np.where(few, "too few roundels in the frame", "no wand among the roundels").astype(object)
     if (detections.label >= 0).any():
         reason[counts > 0] = "no marker of the wand in the frame"
-        return _label_by_number(detections, markers), reason
+        labels = _label_by_number(detections, markers)
+        if (
+            any(wand.codes) and not timing.synchronous
+        ):  # a code that is blurred in one frame is read in the next
+            labels = propagate_labels(frames, detections, labels, markers)
+        return labels, reason
     if markers == 1:
         reason[counts > 1] = "ambiguous"
         return np.where(counts[detections.frame] == 1, 0, -1), reason

@@ -25,6 +25,7 @@ from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
+from camera_node.geometry.codes import PLAIN
 from camera_node.geometry.pose import invert, rigid_motions
 from camera_node.protocol.messages import Detections
 
@@ -99,8 +100,9 @@ class WorldChange:
 
 
 def name_markers(body: Body) -> dict[str, Array]:
-    """The markers of a body as landmarks: their numbers and positions (3,), metres."""
-    return {str(k): point for k, point in enumerate(body.points)}
+    """The markers of a body as landmarks: their names, as in `StillRoundel`, and positions (3,), metres."""
+    names = [f"code {code}" if code != PLAIN else str(k) for k, code in enumerate(body.codes)]
+    return dict(zip(names, body.points, strict=True))
 
 
 def align_to_roundels(
@@ -161,7 +163,7 @@ def locate_landmarks(
 
     Args:
         cameras: placed cameras.
-        roundels: stationary roundels; a number that is the name of a landmark identifies it.
+        roundels: stationary roundels; one with the name of a landmark is that one.
         landmarks: surveyed positions (3,) by name, metres, in a frame of their own.
         of: what has the landmarks, in errors.
 
@@ -174,7 +176,7 @@ def locate_landmarks(
     roundels = [r for r in roundels if r.camera in cameras]
     named: dict[str, list[StillRoundel]] = {name: [] for name in landmarks}
     for roundel in roundels:
-        named.get(str(roundel.id), []).append(roundel)
+        named.get(roundel.name, []).append(roundel)
     if any(named.values()):
         return _triangulate(cameras, named)
     points = _triangulate_pairs(cameras, roundels)

@@ -54,7 +54,7 @@ def place_by_points(
     Args:
         name: of the camera, in errors.
         camera: its lens; a pose that it has is not used.
-        roundels: of this camera; a number that is the name of a point identifies it.
+        roundels: of this camera; one with the name of a point is that one.
         points: (3,) by name, metres, world.
         sigma_m: standard deviation of one coordinate of a point.
 
@@ -62,7 +62,8 @@ def place_by_points(
         CalibrationError: fewer than four points are seen, they lie on a line, or two poses fit them.
     """
     places, pixels = np.array(list(points.values()), float), np.array([r.uv for r in roundels]).reshape(-1, 2)
-    rows = _numbered(list(points), roundels)
+    row = {roundel.name: k for k, roundel in enumerate(roundels)}
+    rows = np.array([row.get(point, -1) for point in points], np.intp)
     if not (rows >= 0).any():
         rows = _assign(name, camera, pixels, places)
     seen = np.flatnonzero(rows >= 0)
@@ -83,12 +84,6 @@ def place_by_points(
     )
     names = [list(points)[k] for k in seen]
     return Resection(placed, dict(zip(names, misses.tolist(), strict=True)))
-
-
-def _numbered(names: Sequence[str], roundels: Sequence[StillRoundel]) -> Index:
-    """(N,) the roundel whose number is the name of each point, -1 where none is."""
-    row = {str(roundel.id): k for k, roundel in enumerate(roundels)}
-    return np.array([row.get(name, -1) for name in names], np.intp)
 
 
 def _assign(name: str, camera: Camera, pixels: Array, places: Array) -> Index:

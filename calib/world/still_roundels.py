@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
 from camera_node.detection.disc_pose import DiscPose, locate
@@ -25,35 +26,42 @@ class StillRoundel:
     Attributes:
         camera: its name.
         uv: (2,) mean centre of the ellipse, raw pixels.
-        id: its number, or -1.
+        name: its number, or "code 7" of a code that was read; empty without either.
         shape: (2, 2) mean of a^2 e e' + b^2 f f' for ellipses with half axes a and b along the unit vectors e and f,
             square pixels; NaN where it is unknown.
     """
 
     camera: str
     uv: Array
-    id: int
+    name: str
     shape: Array
 
 
 def find_still_roundels(messages: Sequence[Detections]) -> list[StillRoundel]:
-    """Find the roundels that each camera detects at the same pixel, under one number or none, in 30 % of its frames or
+    """Find the roundels that each camera detects at the same pixel, under one name or none, in 30 % of its frames or
     more."""
     frames: dict[str, list[Roundels]] = {}
     for message in messages:
         frames.setdefault(message.camera, []).append(message.unpack())
     found = []
     for camera, seen in frames.items():
-        uv, ids = np.concatenate([r.uv for r in seen]), np.concatenate([r.id for r in seen])
+        uv, names = np.concatenate([r.uv for r in seen]), np.concatenate([_names(r) for r in seen])
         shapes = np.concatenate([_shapes(r) for r in seen])
-        order = np.argsort(ids, kind="stable")
-        for rows in np.split(order, np.flatnonzero(np.diff(ids[order])) + 1):
+        order = np.argsort(names, kind="stable")
+        for rows in np.split(order, np.flatnonzero(names[order[1:]] != names[order[:-1]]) + 1):
             for cluster in _clusters(uv[rows]):
                 if len(cluster) >= max(MIN_PRESENCE * len(seen), 1):
                     chosen = rows[cluster]
                     mean, shape = uv[chosen].mean(axis=0), shapes[chosen].mean(axis=0)
-                    found.append(StillRoundel(camera, mean, int(ids[chosen[0]]), shape))
+                    found.append(StillRoundel(camera, mean, str(names[chosen[0]]), shape))
     return found
+
+
+def _names(roundels: Roundels) -> NDArray[np.str_]:
+    """(N,) names as in `StillRoundel`."""
+    numbers = roundels.id.astype(str)
+    with_codes = np.where(np.isfinite(roundels.id_probability), np.char.add("code ", numbers), numbers)
+    return np.where(roundels.id < 0, "", with_codes)
 
 
 def _shapes(roundels: Roundels) -> Array:

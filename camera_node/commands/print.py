@@ -47,7 +47,8 @@ class Sheet:
     surround_ratio: float = 9 / 7
     """roundels: white card over outer diameter, d / d_o; increase it for dark floors and distant cameras."""
     codes: str | None = None
-    """roundels: print those with these codes, such as 1-12 or 3,7,20-25; plain ones unless given."""
+    """roundels: print those with these codes, such as 1-12 or 3,7,20-25; plain ones unless given.
+    wand, l-frame, robot: one for each marker."""
     paper: str = "a4"
     """a4, a3, a2, letter or tabloid."""
     file: Path | None = None
@@ -105,24 +106,27 @@ class Sheet:
         path = self.file or example_file(EXAMPLES[self.what])
         if self.what != "robot":
             body = load_yaml(path, PrintedWand if self.what == "wand" else Body)
-            return self.what, self._resized(body)
+            return self.what, self._changed(body)
         robots = load_yaml(path, _Robots).robots
         name = self.name or next(iter(robots), "")
         if name not in robots:
             raise ConfigError(f"{path} has no robot '{name}'; it has {', '.join(robots) or 'none'}")
         fields = {key: value for key, value in robots[name].items() if key in Body.__struct_fields__}
         try:
-            return name, self._resized(msgspec.convert(fields, Body))
+            return name, self._changed(msgspec.convert(fields, Body))
         except (msgspec.ValidationError, ValueError) as error:
             raise ConfigError(f"{path}: robot {name}: {error}") from None
 
-    def _resized(self, body: Body) -> Body:
-        if self.diameter is None:
-            return body
-        try:
-            return Body(**{**msgspec.structs.asdict(body), "diameter_m": self.diameter})
-        except ValueError as error:
-            raise ConfigError(f"--diameter: {error}") from None
+    def _changed(self, body: Body) -> Body:
+        """The body with the diameter and the codes of the command line."""
+        codes = self.codes and tuple(parse_codes(self.codes))
+        given = {"--diameter": ("diameter_m", self.diameter), "--codes": ("code", codes)}
+        for option, (field, value) in given.items():
+            try:
+                body = body if value is None else msgspec.structs.replace(body, **{field: value})
+            except ValueError as error:
+                raise ConfigError(f"{option}: {error}") from None
+        return body
 
     def _body_pages(self, name: str, body: Body) -> list[Page]:
         """One page with the whole body where it fits, else a card for each roundel."""

@@ -139,6 +139,10 @@ class PrintedWand(Body, frozen=True, kw_only=True, forbid_unknown_fields=True, o
             raise ValueError(
                 "a wand has no normals: its prints face one way, or both ways, thickness_m apart; leave normals out"
             )
+        if codes.PLAIN in self.codes and any(self.codes):
+            raise ValueError(
+                "a wand has a code at each of its markers, or at none; print those that are missing"
+            )
         if not 0 <= self.thickness_m <= MAX_THICKNESS_M:
             raise ValueError(
                 f"thickness_m is {self.thickness_m}; give metres from 0 to {MAX_THICKNESS_M:g}, or leave it out"

@@ -5,11 +5,12 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from calib.errors import CalibrationError
-from calib.world.landmarks import FRAME, locate_landmarks, read_positions
+from calib.world.landmarks import FRAME, locate_landmarks, name_markers, read_positions
 from calib.world.still_roundels import find_still_roundels
 from calib.world.world_frame import align_positions, align_standing_wand, check_above
 from camera_node.foundation.config import load_yaml
@@ -60,6 +61,25 @@ def test_an_l_shaped_frame_fixes_the_world(numbered: bool):
     assert max(distances.values()) < 5e-4
     for name, camera in moved.cameras.items():
         assert camera.matrix() == pytest.approx(arena.truth.cameras[name].matrix(), abs=2e-3)
+
+
+@pytest.mark.parametrize("code", [(), (3, 1, 2)])
+def test_the_code_of_a_robot_is_no_number_of_a_marker(code: tuple[int, ...]):
+    """A robot with code 1 stands beside an L-frame of which marker 1 is plain, or has another code."""
+    arena = ring(4)
+    body = Body(diameter_m=0.09, markers=((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.5, 0.0)), code=code)
+    landmarks = name_markers(body)
+    markers = body.points.tolist()
+    places = dict(zip(map(str, code) if code else ("-1", "-2", "-3"), markers, strict=True))
+    robot = {} if code else {"1": [0.6, 0.4, 0.1]}
+    messages = []
+    for message in detect_landmarks(arena, places | robot, numbered=True):
+        ids = np.frombuffer(message.id, "<i4")
+        probability = np.where(ids > 0, 1.0, np.nan).astype("<f4").tobytes()
+        messages.append(msgspec.structs.replace(message, id_probability=probability))
+    located = locate_landmarks(arena.truth.cameras, find_still_roundels(messages), landmarks)
+    for name, at in landmarks.items():
+        assert located[name] == pytest.approx(at, abs=5e-4)
 
 
 @pytest.mark.parametrize("normal", [[0.0, 0.0, 1.0], [0.48, -0.36, 0.8]])

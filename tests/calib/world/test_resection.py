@@ -33,7 +33,7 @@ def see(points: dict[str, np.ndarray], number: bool = True, noise_px: np.ndarray
     """The roundels at the points in the camera."""
     uv = camera().project_world(np.array(list(points.values()))) + noise_px
     return [
-        StillRoundel("cam1", at, int(name) if number else -1, UNKNOWN_SHAPE)
+        StillRoundel("cam1", at, name if number else "", UNKNOWN_SHAPE)
         for name, at in zip(points, uv, strict=True)
     ]
 

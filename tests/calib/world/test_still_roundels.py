@@ -25,6 +25,6 @@ def test_numbered_points_stay_apart_however_near_they_are():
         )
         for seq, uv in enumerate(frames)
     ]
-    found = {roundel.id: roundel.uv for roundel in find_still_roundels(messages)}
+    found = {int(roundel.name): roundel.uv for roundel in find_still_roundels(messages)}
     assert sorted(found) == list(range(1716))
     assert np.abs(np.array([found[k] for k in range(1716)]) - places).max() < 0.2

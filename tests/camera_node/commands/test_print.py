@@ -16,7 +16,7 @@ from camera_node.detection.detector import Detector
 from camera_node.foundation.config import example_file, load_yaml
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry import codes
-from camera_node.geometry.body import Body
+from camera_node.geometry.body import Body, PrintedWand
 from camera_node.sources.recorded_frames import read_grey
 from fusion.model.robots import load_robots
 
@@ -129,6 +129,14 @@ def test_codes_are_printed_as_their_words_state(tmp_path: Path):
 def test_codes_that_do_not_exist_are_refused(tmp_path: Path, text: str):
     with pytest.raises(ConfigError, match="--codes"):
         write(tmp_path, what="roundels", codes=text)
+
+
+def test_a_wand_is_printed_with_codes_and_another_diameter(tmp_path: Path):
+    out = write(tmp_path, what="wand", codes="5,3,9", diameter=0.05)
+    wand = load_yaml(out.with_suffix(".yaml"), PrintedWand)
+    assert (wand.codes, wand.diameter_m) == ((5, 3, 9), 0.05)
+    with pytest.raises(ConfigError, match="--codes: 2 codes for 3 markers"):
+        write(tmp_path, what="wand", codes="5,3")
 
 
 def test_a_robot_is_printed_as_its_yaml_declares_it(tmp_path: Path):
