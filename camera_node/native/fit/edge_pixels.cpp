@@ -248,7 +248,7 @@ ROUNDEL_CLONES void add_outside(const EdgePixels& pixels, const CircleImage& car
     const float yy = float(card.shape.xx / det), x0 = float(card.x), y0 = float(card.y);
     for (int k = 0; k < pixels.count; k += kLanes) {
         const Lanes dx = load(pixels.x + k) - x0, dy = load(pixels.y + k) - y0,
-                    level = load(pixels.level + k);
+                    level = shown(load(pixels.level + k));
         const Bits outside = (dx * (xx * dx + xy * dy) + yy * dy * dy > 1.0f) & (level >= 0.0f);
         mean.sum += outside ? level : all(0);
         mean.n += outside ? all(1) : all(0);
@@ -341,6 +341,17 @@ void EdgePixels::sample(int n, EdgePixels& to) const {
         }
         to.end_part(part.edge);
     }
+}
+
+bool mark_clipped(double paper, bool known, EdgePixels& pixels) {
+    if (paper < double(kClipped) && !known) return false;
+    float* const end = pixels.level + pixels.count;
+    const auto above = [&](float least) {
+        return std::count_if(pixels.level, end, [&](float level) { return level > least; });
+    };
+    if (4 * above(kSaturated) < above(kClipped) && !known) return false;
+    std::for_each(pixels.level, end, [](float& level) { level += level > kClipped ? kBound : 0; });
+    return true;
 }
 
 double level_beyond_card(const EdgePixels& pixels, const Parameters& p) {

@@ -81,6 +81,11 @@ struct EdgeBand {
 void select_pixels(const ImageView& image, const Parameters& p, const EdgeBand& band, int limit,
                    EdgePixels& pixels);
 
+/// Makes the levels near the scale's end lower bounds, if the paper is `known` to be clipped or its level is
+/// near the end and a quarter of theirs are at the end: half of those that compression scatters are, and
+/// edges add as many again. Returns whether it did.
+bool mark_clipped(double paper, bool known, EdgePixels& pixels);
+
 /// The mean level of the pixels beyond the card's edge; the bright level if there are none.
 double level_beyond_card(const EdgePixels& pixels, const Parameters& p);
 

@@ -89,7 +89,7 @@ ROUNDEL_INLINE void add_products(const Gradient* chunks, int lanes, PartPixels a
         for (int k = 0; k < count; ++k, at.x += kLanes, at.y += kLanes, at.level += kLanes) {
             const Lanes residual = chunks->residual[k];
             const Lanes root = root_weight<edge>(*chunks, k, residual, weighting);
-            basis.columns(load(at.x), load(at.y), load(at.level) - residual, chunks->ring[k], columns);
+            basis.columns(load(at.x), load(at.y), shown(load(at.level)) - residual, chunks->ring[k], columns);
             for (int a = 0; a < N; ++a) {
                 weighted[a][k] = root * root * columns[a];
                 for (int b = 0; b <= a; ++b) sums.own[a][b] += weighted[a][k] * columns[b];

@@ -170,6 +170,7 @@ EdgeMisfit::EdgeMisfit(const ImageView& image, const Parameters& p, const Fields
     local[kX] -= pixels.origin_x;
     local[kY] -= pixels.origin_y;
     select_pixels(image, local, {kBand, kBand, true}, kPixels, pixels);
+    mark_clipped(p[kBright], false, pixels);
     if (fields.any()) fields.remove_from(pixels);
     add_misfit(pixels, Model(local), SectorIndex(local), edges_);
 }

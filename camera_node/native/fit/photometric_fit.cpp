@@ -37,9 +37,8 @@ constexpr double kGroundChance = 4;  // standard deviations of the ground's resi
 constexpr double kEvenGround = 4;    // spread that halves the weight of pixels at the card's edge
 constexpr double kReweighed = 0.1;   // of a step that changes the weights of residuals: what is left of it
 constexpr double kInitialBlur = 0.8;
-constexpr double kRatioPrior = 0.3;    // standard deviation
-constexpr double kBlurPrior = 1;       // standard deviation
-constexpr double kClippedShare = 0.1;  // of a roundel's pixels at 255, from which its paper is clipped
+constexpr double kRatioPrior = 0.3;  // standard deviation
+constexpr double kBlurPrior = 1;     // standard deviation
 
 constexpr SanityLimits kFitLimits{
     .shift = 0.1, .min_size = 0.7, .max_size = 1.4, .blur = 0.1, .underflow = 64, .overflow = 600};
@@ -48,8 +47,7 @@ constexpr SanityLimits kFitLimits{
 constexpr double kStrictScale = 0.5;
 constexpr double kSlackScale = 1.3;  // the tolerance of a median of few residuals
 
-constexpr double kSeparateBlurs = 4;    // of wide bands that contain a single edge, and of plateaus
-constexpr float kClippedPlateau = 235;  // level that compression leaves of clipped paper
+constexpr double kSeparateBlurs = 4;  // of wide bands that contain a single edge, and of plateaus
 
 /// Chi-square with two degrees of freedom from which residuals show a field: by chance once in 22,000.
 constexpr double kUnlikelyField = 20;
@@ -183,6 +181,7 @@ class PhotometricFitter : GaussNewton<kCount> {
     OcclusionMask occlusion_;
     AllowedFields allowed_;
     bool resumed_;  // from the last frame's model
+    bool known_clipped_;
     // The pixels, and the last linearization
     EdgePixels pixels_;
     EdgePixels sample_;
@@ -204,21 +203,12 @@ class PhotometricFitter : GaussNewton<kCount> {
     ShadingEstimate shading_;
 };
 
-/// Sets bright pixels to the scale's end if many are there, since compression scatters the levels of clipped
-/// paper; returns whether it did.
-bool restore_clipped(EdgePixels& pixels) {
-    float* const end = pixels.level + pixels.count;
-    const auto clipped = std::count_if(pixels.level, end, [](float level) { return level > kSaturated; });
-    if (double(clipped) < kClippedShare * pixels.used) return false;
-    std::replace_if(pixels.level, end, [](float level) { return level > kClippedPlateau; }, 255.0f);
-    return true;
-}
-
 PhotometricFitter::PhotometricFitter(const ImageView& image, const InitialGuess& guess)
     : image_(image),
       occlusion_(guess.occlusion),
       allowed_(guess.occlusion.any() ? AllowedFields::kNone : guess.fields),
-      resumed_(guess.model.has_value()) {
+      resumed_(guess.model.has_value()),
+      known_clipped_(guess.clipped) {
     pixels_.origin_x = int(std::lround(guess.outer.x));
     pixels_.origin_y = int(std::lround(guess.outer.y));
     p_ = start_ = initial_parameters(guess, pixels_.origin_x, pixels_.origin_y, kInitialBlur);
@@ -258,7 +248,7 @@ bool PhotometricFitter::select(EdgeBand band, int limit) {
     if (occlusion_.any()) band.separate = 0;
     select_pixels(image_, p_, band, limit, pixels_);
     if (occlusion_.any()) remove_occluded(occlusion_, start_, pixels_);
-    clipped_ = restore_clipped(pixels_);
+    clipped_ = mark_clipped(p_[kBright], known_clipped_, pixels_);
     if (fields_.fitted) fields_.in_image.remove_from(pixels_);
     return pixels_.used >= 2 * kCount;
 }
@@ -471,8 +461,7 @@ bool PhotometricFitter::condition_on_plateau(Parameter level, const Plateau& pla
     if (plateau.count == 0 || plateau.variance > kPlateauVariance * square(noise_) ||
         plateau.variance < square(noise_) / kPlateauVariance)
         return false;
-    if (plateau.mean < 2 * noise_ || plateau.mean > double(kClippedPlateau))
-        return false;  // the scale's ends
+    if (plateau.mean < 2 * noise_ || plateau.mean > double(kClipped)) return false;  // the scale's ends
     Parameters unit{};
     unit[level] = 1;
     double variance = 1.0 / plateau.count;  // in units of the noise: of the plateau, and of the fit's level

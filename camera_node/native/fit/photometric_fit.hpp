@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <optional>
@@ -47,6 +48,7 @@ struct InitialGuess {
     double ground = 0;                  // and `RoundelFit::ground`
     CameraPrior camera{};
     AllowedFields fields = AllowedFields::kNone;
+    bool clipped = false;  // the paper is known to be brighter than the camera can show
 };
 
 /// Covariance (7, 7) of the outer ellipse's centre x, y, of its shape Axx, Axy, Ayy (the ellipse is
@@ -103,6 +105,8 @@ struct RoundelFit {
     Fields fields{};           // that the fit contains, in the image's frame
     Bend bend{};
     double contrast() const { return bright - dark; }
+    /// A level from ink (0) to paper (1) as the picture shows it, which ends at 255.
+    double share(double level) const { return (level - dark) / (std::min(bright, 255.0) - dark); }
     /// Whether the noise and a model error of `misfit` contrasts explain the residuals on the ring's edges.
     bool is_explained(double image_noise, double misfit) const {
         return edge_residual < std::hypot(1.2 * image_noise, misfit * contrast());

@@ -56,13 +56,18 @@ inline CircleImage circle_image(const Parameters& p, double r) {
 
 constexpr float kAbsent = 1e9f;  // a residual that does not count
 
-/// Pixels that do not count: padding (level -1), and clipped pixels whose modelled `level` is out of range.
 constexpr float kSaturated = 254.5f;
-// Noise that lifts a pixel to the scale's end is cut off, so clipped pixels count only if the model is far
-// below.
-constexpr float kClipped = 225;
+/// Added to a level that is a lower bound: noise and compression scatter the levels of clipped paper to below
+/// the scale's end.
+constexpr float kBound = 256;
+constexpr float kClipped = 225;  // the least of the levels that they make of it
+
+/// The grey level of a pixel that may be a lower bound.
+ROUNDEL_INLINE Lanes shown(const Lanes& seen) { return seen - (seen < kBound ? all(0) : all(kBound)); }
+
+/// Pixels that do not count: padding (level -1), and clipped pixels whose modelled `level` is out of range.
 ROUNDEL_INLINE Bits is_uninformative(const Lanes& seen, const Lanes& level) {
-    const Bits clipped = ((seen > kSaturated) & (level > kClipped)) | ((seen < 0.5f) & (level < 0.0f));
+    const Bits clipped = ((seen > kSaturated) & (level > shown(seen))) | ((seen < 0.5f) & (level < 0.0f));
     return (seen < 0.0f) | clipped;
 }
 
@@ -240,7 +245,7 @@ class ModelOf {
     }
 
     ROUNDEL_INLINE static Lanes compare(const Lanes& seen, const Lanes& level) {
-        return is_uninformative(seen, level) ? all(kAbsent) : seen - level;
+        return is_uninformative(seen, level) ? all(kAbsent) : shown(seen) - level;
     }
 
     float x_, y_, gx_, gy_, inverse_xx_, inverse_xy_, inverse_yy_, ratio_, card_;

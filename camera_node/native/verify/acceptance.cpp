@@ -246,7 +246,10 @@ static std::optional<RoundelFit> fit_at_full_size(const ImageView& image, const 
         fit_occluded(image, {guess, fit, misfit, at_edges, known || accepted, context.knows_camera});
     if (rest && is_within_limits(*rest, context.limits)) return rest;
     if (accepted) return fit;
-    return elliptic && may_be_ragged(fit, context.limits) ? fit_ragged(image, guess, context) : std::nullopt;
+    if (!elliptic || !may_be_ragged(fit, context.limits)) return std::nullopt;
+    InitialGuess ragged = guess;
+    ragged.clipped = fit.clipped;
+    return fit_ragged(image, ragged, context);
 }
 
 /// Fits a roundel with what is known of its camera; a large one that is refused at half the size.

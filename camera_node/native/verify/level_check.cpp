@@ -10,7 +10,7 @@ namespace roundel {
 
 LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     const Ellipse& e = fit.outer;
-    const double contrast = fit.contrast(), edge = 2 * fit.blur;  // levels further away are constant
+    const double edge = 2 * fit.blur;  // levels further away are constant
     const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
     const EllipseLevels on(e);
     LevelSamples samples;
@@ -20,9 +20,8 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
             if (levels[k] < 0) continue;
             const auto [x, y] = on.point(k, scale);
             const double level = fit.fields.even_level(double(x), double(y), double(levels[k]));
-            const double share = (level - fit.dark) / contrast;  // 0 is ink, 1 is paper
             ++samples.total;
-            samples.wrong += std::abs(share - (dark ? 0 : 1)) > kWrongLevel;
+            samples.wrong += std::abs(fit.share(level) - (dark ? 0 : 1)) > kWrongLevel;
         }
     };
     for (const double share : {0.25, 0.5, 0.75})
@@ -39,7 +38,7 @@ constexpr double kRingDepths[] = {0.3, 0.5};
 
 /// Whether rings that are darker than paper by `depth` of the contrast surround this one.
 static bool has_rings_around(const ImageView& image, const RoundelFit& fit, double depth) {
-    const float theta = float(fit.bright - depth * fit.contrast());
+    const float theta = float(fit.dark + (1 - depth) * (std::min(fit.bright, 255.0) - fit.dark));
     const int below = int(std::ceil(theta));
     const Ellipse& e = fit.outer;
     const double c = std::cos(e.angle), s = std::sin(e.angle);

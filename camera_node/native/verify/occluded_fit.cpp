@@ -56,7 +56,7 @@ class SectorView {
             const auto [x, y] = point_in_sector(fit_.p, s, radius);
             const float seen = sample(image_, x, y);
             const double level = fit_.fields.even_level(double(x), double(y), double(seen));
-            found |= Sectors(seen >= 0 && test((level - fit_.dark) / (fit_.bright - fit_.dark))) << s;
+            found |= Sectors(seen >= 0 && test(fit_.share(level))) << s;
         }
         return found;
     }

@@ -173,6 +173,15 @@ def test_the_size_of_over_exposed_prints_is_claimed_before_the_tone_curve_is_kno
     assert errors(Detector(), Sensor(tone="gamma", gain=1.5, noise=2.0), band, 2).size < 3
 
 
+@pytest.mark.parametrize(("jpeg", "band"), [(None, (20, 32)), (90, (32, 60))])
+def test_compressed_levels_of_clipped_paper_are_lower_bounds(jpeg, band):
+    """They counted as the paper's level: squared errors were 299 and 197 times the variances of sizes."""
+    measured = errors(Detector(), Sensor(tone="gamma", gain=1.9, noise=2.0, jpeg=jpeg), band, 2)
+    assert measured.found > 0.97
+    assert measured.centre < 3
+    assert measured.size < 3
+
+
 def test_the_light_that_falls_off_towards_the_corners_is_learned():
     """On clutter a roundel shows little of it; without the camera's fall-off centres lie 0.01 px outwards."""
     outwards = []
