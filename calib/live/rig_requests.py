@@ -19,7 +19,6 @@ from calib.rig.rig_messages import (
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.requests import (
-    ANSWER_S,
     REQUEST_S,
     RETRY_S,
     RequestSource,
@@ -50,19 +49,19 @@ def set_rig(
         NetworkError: no server answers in time.
     """
     request = RigRequest(rig=rig, source=RequestSource.of(program))
-    return _read(send_request(session, set_rig_key(arena), encode(request), timeout_s, ANSWER_S))
+    return _read(send_request(session, set_rig_key(arena), encode(request), timeout_s))
 
 
 def undo_rig(session: zenoh.Session, arena: str, program: str, timeout_s: float = REQUEST_S) -> RigMessage:
     """Have the server undo the last change of its rig; returns and raises as `set_rig`."""
     request = encode(RigStepRequest(source=RequestSource.of(program)))
-    return _read(send_request(session, undo_rig_key(arena), request, timeout_s, ANSWER_S))
+    return _read(send_request(session, undo_rig_key(arena), request, timeout_s))
 
 
 def redo_rig(session: zenoh.Session, arena: str, program: str, timeout_s: float = REQUEST_S) -> RigMessage:
     """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`."""
     request = encode(RigStepRequest(source=RequestSource.of(program)))
-    return _read(send_request(session, redo_rig_key(arena), request, timeout_s, ANSWER_S))
+    return _read(send_request(session, redo_rig_key(arena), request, timeout_s))
 
 
 def request_rig_history(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> RigHistory:

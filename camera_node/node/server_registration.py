@@ -107,7 +107,9 @@ class Registration:
         change = CameraChange(
             camera=self._request.id, settings=settings, source=RequestSource.of("camera_node")
         )
-        self._enqueue(lambda: send_request(self._session, change_key(self._arena), encode(change), ASK_S))
+        self._enqueue(
+            lambda: send_request(self._session, change_key(self._arena), encode(change), ASK_S, ASK_S)
+        )
 
     def close(self) -> None:
         """End the thread and the subscriptions."""
@@ -136,7 +138,7 @@ class Registration:
     def _request_assignment(self) -> CameraAssignment:
         assigned = self.assigned
         request = msgspec.structs.replace(self._request, name=assigned.name) if assigned else self._request
-        answer = send_request(self._session, register_key(self._arena), encode(request), ASK_S)
+        answer = send_request(self._session, register_key(self._arena), encode(request), ASK_S, ASK_S)
         try:
             return decode(answer, CameraAssignment)
         except MessageError as error:

@@ -25,7 +25,7 @@ log = logging.getLogger("camera_node.requests")
 QUALITY = 85  # JPEG quality unless the request gives one
 MAX_PAYLOAD = 1 << 20  # bytes
 REQUEST_S = 5.0  # for a program that answers to be found
-ANSWER_S = 60.0  # for the answer to a new rig: a server computes tables of its lenses
+ANSWER_S = 60.0  # for an answer: to a new rig a server computes tables of its lenses
 RETRY_S = 0.1
 MAX_SOURCE = 64  # characters of each part of a request's source
 Part = Annotated[str, msgspec.Meta(max_length=MAX_SOURCE)]
@@ -72,7 +72,7 @@ def send_request(
     key: str,
     payload: bytes = b"",
     timeout_s: float = REQUEST_S,
-    answer_s: float = 0.0,
+    answer_s: float = ANSWER_S,
 ) -> bytes:
     """Send a request until a program answers it.
 
@@ -80,8 +80,8 @@ def send_request(
         session: an open session.
         key: of the queryable.
         payload: of the request.
-        timeout_s: for a program to be found, and for its answer unless `answer_s` is longer.
-        answer_s: for the answer of a program that was found.
+        timeout_s: for a program to be found.
+        answer_s: for the answer of a program that was found, which may run on a busy machine.
 
     Raises:
         RequestError: the request is refused; the message is the program's.

@@ -5,6 +5,7 @@ Where the measured normals of the markers differ by 45 degrees or more, the robo
 marker has the normal of its side.
 """
 
+import contextlib
 import math
 import queue
 import time
@@ -23,7 +24,7 @@ from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Keys, MessageError, decode
-from camera_node.protocol.requests import RequestSource
+from camera_node.protocol.requests import REQUEST_S, RequestSource
 from fusion.errors import FusionError
 from fusion.model.likeness import SIDE_COS, distances
 from fusion.model.robots import MotionModel, Robot
@@ -89,33 +90,49 @@ class StationaryMarkers:
 
 
 def collect_markers(session: zenoh.Session, arena: str, seconds: float) -> list[Markers]:
-    """The markers that a running server publishes within `seconds`.
+    """Messages of a running server that contain unlabeled markers, from the first one until one `seconds` later.
+
+    A busy machine fuses fewer frames, and of some only those of one camera, which locate no marker: such messages say
+    nothing about markers that keep still, and are left out.
+
+    Returns:
+        The messages; none if for `REQUEST_S` none contained an unlabeled marker.
 
     Raises:
-        FusionError: it publishes none.
+        FusionError: the server publishes no markers at all.
     """
     received: queue.Queue[bytes] = queue.Queue()
     subscriber = session.declare_subscriber(
         Keys(arena).markers, lambda sample: received.put(sample.payload.to_bytes())
     )
-    end, messages = time.monotonic() + seconds, []
+    latest_s, is_silent = time.monotonic(), True
+    first_s, messages = math.inf, []
     try:
-        while (left := end - time.monotonic()) > 0:
-            try:
-                messages.append(decode(received.get(timeout=left), Markers))
-            except (queue.Empty, MessageError):
-                continue
+        while latest_s - first_s < seconds:
+            if (left := latest_s + REQUEST_S - time.monotonic()) <= 0:
+                messages.clear()
+                break
+            with contextlib.suppress(queue.Empty, MessageError):
+                message = decode(received.get(timeout=left), Markers)
+                is_silent = False
+                if len(_unlabeled(message)):
+                    latest_s = time.monotonic()
+                    first_s = min(first_s, latest_s)
+                    messages.append(message)
     finally:
         subscriber.undeclare()
-    if not messages:
+    if is_silent:
         raise FusionError(
-            f"the server published no markers within {seconds:g} s; are cameras running and calibrated?"
+            f"the server published no markers within {REQUEST_S:g} s; are cameras running and calibrated?"
         )
     return messages
 
 
 def find_stationary_markers(messages: Sequence[Markers]) -> StationaryMarkers:
-    """The unlabeled markers that half of the messages or more contain, at one place."""
+    """The unlabeled markers that half of the messages or more contain, at one place.
+
+    A marker that some message labels is that of a robot which the server loses for moments, as on a busy machine.
+    """
     unlabeled = [_unlabeled(message) for message in messages]
     reference = max(unlabeled, key=len, default=np.empty((0, COLUMNS)))
     seen = np.full((len(unlabeled), len(reference), COLUMNS), np.nan)
@@ -126,7 +143,10 @@ def find_stationary_markers(messages: Sequence[Markers]) -> StationaryMarkers:
     if not seen.size:
         return StationaryMarkers.of(np.empty((1, 0, COLUMNS)))
     spread = np.nanmedian(np.linalg.norm(seen[..., PLACE] - np.nanmedian(seen[..., PLACE], 0), axis=2), 0)
-    return StationaryMarkers.of(seen[:, spread < STATIONARY_M])
+    markers = StationaryMarkers.of(seen[:, spread < STATIONARY_M])
+    labeled = np.vstack([message.positions()[message.robot_index() >= 0] for message in messages])
+    off = np.linalg.norm(markers.position[:, None] - labeled, axis=2)
+    return markers.select(~(off < SAME_M).any(1))
 
 
 def robot_from_markers(

@@ -7,13 +7,14 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say, track
 from fusion.export.pose_formats import require_own_format, write_csv
 from fusion.model.limits import Limits
+from fusion.model.robots import load_robots
 from fusion.recordings.arena_recording import read_recording
 from fusion.recordings.offline_fusion import (
     OfflineArena,
     Summary,
     cameras_of,
     fuse_again,
-    robots_of,
+    require_held,
     write_recording,
 )
 
@@ -44,7 +45,9 @@ def replay(
     if out.exists() and recording.exists() and out.samefile(recording):
         raise ConfigError(f"--out {out} is the recording itself; give another file, which is then replaced")
     recorded = read_recording(recording)
-    cameras, declared = cameras_of(recorded, recording, rig), robots_of(recorded, recording, robots)
+    require_held(recorded, recording, rig=rig or recorded.rig, robots=robots or recorded.robots)
+    cameras = cameras_of(recorded, recording, rig)
+    declared = load_robots(robots) if robots else recorded.robots
     arena = OfflineArena(cameras, declared, rate_hz, recorded.limits or Limits(), smooth)
     summary = Summary(faults=recorded.faults)
     forms_sets = rig is not None or rate_hz is not None

@@ -59,8 +59,11 @@ class RecordedPoses:
 
     def _check(self) -> None:
         if not self.counts and not self._robots:
+            rig = "" if self.cameras else " --rig rig.yaml"
+            robots = "" if self.bodies else " --robots robots.yaml"
             raise ConfigError(
-                f"{self.path} holds no poses; write them with roundel replay {self.path} --out fused.mcap"
+                f"{self.path} holds no poses; write them with "
+                f"roundel replay {self.path}{rig}{robots} --out fused.mcap"
             )
         if missing := sorted(self._robots - set(self.counts)):
             raise ConfigError(f"{self.path} holds no poses of {', '.join(missing)}; check --robots")

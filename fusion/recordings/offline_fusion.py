@@ -24,7 +24,7 @@ from fusion.errors import FusionError
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
-from fusion.model.robots import Robot, load_robots
+from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusedFrames
 from fusion.recordings.arena_recording import DETECTIONS, ArenaRecording, skipped
 from fusion.server.frame_synchronizer import FrameSynchronizer
@@ -280,20 +280,15 @@ def cameras_of(recording: ArenaRecording, path: Path, rig: Path | None) -> dict[
     """
     if rig is not None:
         return load_rig(rig).require_placed(rig)
-    if recording.rig is None:
-        raise ConfigError(f"{path} holds no rig{skipped(recording.faults)}; give --rig rig.yaml")
-    return recording.rig.placed()
+    require_held(recording, path, rig=recording.rig)
+    return recording.rig.placed() if recording.rig is not None else {}
 
 
-def robots_of(recording: ArenaRecording, path: Path, robots: Path | None) -> dict[str, Robot]:
-    """The robots of the file `robots`, or else of the recording.
-
-    Raises:
-        ConfigError, FusionError: there are none, or they can't be tracked.
-    """
-    if robots is None and not recording.robots:
-        raise ConfigError(f"{path} holds no robots{skipped(recording.faults)}; give --robots robots.yaml")
-    return load_robots(robots) if robots else recording.robots
+def require_held(recording: ArenaRecording, path: Path, **held: object) -> None:
+    """Raise ConfigError unless the recording or an option gives each of `held`, named as its option is."""
+    if lacks := [name for name, value in held.items() if not value]:
+        options = " and ".join(f"--{name} {name}.yaml" for name in lacks)
+        raise ConfigError(f"{path} holds no {' and no '.join(lacks)}{skipped(recording.faults)}; give {options}")
 
 
 def write_recording(source: Path, out: Path, fused: Iterable[TrackingResult]) -> None:

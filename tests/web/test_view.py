@@ -110,12 +110,7 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
     tables = "[...document.querySelectorAll('table')].map(t => t.offsetWidth - t.parentElement.clientWidth)"
     assert max(page.evaluate(tables)) <= 0, "a table is wider than the panel"
     page.wait_for_function("[...document.querySelectorAll('input')].some(input => input.value === 'east')")
-    for _ in range(4):  # on a busy machine the view may give up before the answer arrives
-        page.get_by_role("button", name="Take a snapshot").click()
-        answer = page.get_by_text(re.compile("east, 64 x 48|sent no image"))
-        answer.wait_for()
-        if "64 x 48" in answer.inner_text():
-            break
+    page.get_by_role("button", name="Take a snapshot").click()
     page.get_by_text("east, 64 x 48").wait_for()
     page.get_by_role("tab", name="Calibrate").click()
     assert page.get_by_role("button", name="Undo the last change").is_disabled(), "there is no earlier rig"
@@ -233,8 +228,8 @@ def test_the_default_viewpoint_shows_the_whole_rig(rig: Rig | None, aspect: floa
     np.testing.assert_allclose(seen.max(), MARGIN, atol=0.02)
 
 
-@pytest.mark.parametrize("data", [None, b"", b"not an image", bytes(100)])
-def test_bytes_that_are_not_a_jpeg(data: bytes | None):
+@pytest.mark.parametrize("data", [b"", b"not an image", bytes(100)])
+def test_bytes_that_are_not_a_jpeg(data: bytes):
     assert decode_jpeg(data) is None
 
 

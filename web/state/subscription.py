@@ -14,10 +14,10 @@ from calib.live.rig_requests import redo_rig, request_rig_history, request_rig_m
 from calib.rig.rig_messages import RigVersion
 from camera_node.foundation.errors import RoundelError, printable
 from camera_node.foundation.rate_limit import RateLimit
-from camera_node.protocol.camera_requests import request_settings
+from camera_node.protocol.camera_requests import request_settings, request_snapshot
 from camera_node.protocol.messages import MessageError, Settings, decode
 from camera_node.protocol.presence import ALIVE
-from camera_node.protocol.requests import RequestSource
+from camera_node.protocol.requests import REQUEST_S, RequestSource
 from camera_node.protocol.server_connection import ServerConnection
 from camera_node.protocol.session import guarded
 from fusion.client.robot_definition import collect_markers
@@ -26,9 +26,7 @@ from fusion.protocol.pose_messages import FusionStatus, Markers, Robots, RobotsR
 from fusion.protocol.robot_requests import change_robots, reframe_robot, request_robots
 from web.state.feed import Feed
 
-REQUEST_TIMEOUT_S = 2.0
 RIG_REQUESTS_HZ = 1.0  # however many status messages arrive
-RIG_TIMEOUT_S = 5.0
 # From one request for the declared robots to the next; their markers may change without a message.
 ROBOTS_S = 5.0
 
@@ -52,7 +50,7 @@ class Subscription:
     @property
     def session(self) -> zenoh.Session:
         """The session, for requests. Raises NetworkError while no server answers."""
-        return self.connection.session(REQUEST_TIMEOUT_S)
+        return self.connection.session(REQUEST_S)
 
     def close(self) -> None:
         """End the subscription."""
@@ -70,15 +68,14 @@ class Subscription:
 
     def change_settings(self, camera: str, wanted: Settings | None = None) -> Settings:
         """Change settings of a camera, or none, and return those in use; raises as `request_settings`."""
-        return request_settings(self.session, self.feed.keys.arena, camera, wanted, REQUEST_TIMEOUT_S)
+        return request_settings(self.session, self.feed.keys.arena, camera, wanted)
 
-    def snapshot(self, camera: str, timeout_s: float = REQUEST_TIMEOUT_S) -> bytes | None:
-        """Return a camera's current image as JPEG, or None if the camera does not answer in time."""
-        replies = self.session.get(self.feed.keys.snapshot(camera), timeout=timeout_s)
-        return next((reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None), None)
+    def snapshot(self, camera: str, timeout_s: float = REQUEST_S) -> bytes:
+        """A camera's current image as JPEG; raises as `request_snapshot`."""
+        return request_snapshot(self.session, self.feed.keys.arena, camera, timeout_s=timeout_s)
 
     def collect_markers(self, seconds: float) -> list[Markers]:
-        """Collect the server's marker messages for some seconds; raise FusionError if there are none."""
+        """Collect the server's messages with unlabeled markers; see `fusion.client.robot_definition`."""
         return collect_markers(self.session, self.feed.keys.arena, seconds)
 
     def define(self, name: str, robot: Robot) -> Robots:
@@ -93,22 +90,22 @@ class Subscription:
     def change_robots(self, request: RobotsRequest) -> Robots:
         """Have the server change its robots; returns all robots and raises as `define`."""
         request = msgspec.structs.replace(request, source=RequestSource.of("web"))
-        return self._stored(change_robots(self.session, self.feed.keys.arena, request, REQUEST_TIMEOUT_S))
+        return self._stored(change_robots(self.session, self.feed.keys.arena, request))
 
     def reframe_robot(self, name: str, change: Callable[[Robot], Robot]) -> Robots:
         """Have the server replace a robot by `change` of it; returns all robots and raises as `define`."""
         arena = self.feed.keys.arena
-        return self._stored(reframe_robot(self.session, arena, name, change, "web", REQUEST_TIMEOUT_S))
+        return self._stored(reframe_robot(self.session, arena, name, change, "web"))
 
     def declared_robots(self) -> Robots:
         """All robots of the server. Raises NetworkError if it does not answer."""
-        return request_robots(self.session, self.feed.keys.arena, REQUEST_TIMEOUT_S)
+        return request_robots(self.session, self.feed.keys.arena)
 
     def _stored(self, robots: Robots) -> Robots:
         self.feed.store_robots(robots)
         return robots
 
-    def undo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
+    def undo(self, timeout_s: float = REQUEST_S) -> str:
         """Have the server undo the last change of its rig; return the outcome as text.
 
         Raises:
@@ -119,7 +116,7 @@ class Subscription:
         undo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
         return _describe_step("undone", history.next_undo() if history else None)
 
-    def redo(self, timeout_s: float = REQUEST_TIMEOUT_S) -> str:
+    def redo(self, timeout_s: float = REQUEST_S) -> str:
         """Have the server redo the change of its rig that was undone last; returns and raises as `undo`."""
         history = self.feed.state().history
         redo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
@@ -176,15 +173,15 @@ class Subscription:
         keys = self.feed.keys
 
         def request() -> None:
-            if (data := request_rig_message(session, keys.arena, RIG_TIMEOUT_S)) is not None:
+            if (data := request_rig_message(session, keys.arena)) is not None:
                 self.feed.receive(keys.rig, keys.rig, data)
-                self.feed.store_history(request_rig_history(session, keys.arena, RIG_TIMEOUT_S))
+                self.feed.store_history(request_rig_history(session, keys.arena))
 
         _ask(self._rig_requests, "rig", request)
 
     def _request_robots(self, session: zenoh.Session) -> None:
         def request() -> None:
-            self.feed.store_robots(request_robots(session, self.feed.keys.arena, REQUEST_TIMEOUT_S))
+            self.feed.store_robots(request_robots(session, self.feed.keys.arena))
 
         _ask(self._robots_requests, "robots", request)
 

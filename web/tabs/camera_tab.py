@@ -25,7 +25,7 @@ from web.html_tables import picture_grid
 from web.own_control import OwnControl, each_browser
 from web.scene.camera_frustums import CameraDrawing
 from web.state.feed import ArenaState
-from web.state.subscription import REQUEST_TIMEOUT_S, Subscription
+from web.state.subscription import Subscription
 from web.tables import STALE_S, tabulate_cameras
 from web.tabs.calibration_panels import CalibrationFiles
 from web.tabs.lens_panel import LensPanel
@@ -207,7 +207,7 @@ class CameraSettings:
 
     def _change(self, change: CameraChange) -> None:
         arena = self._subscription.feed.keys.arena
-        change_camera(self._subscription.session, arena, change, REQUEST_TIMEOUT_S)
+        change_camera(self._subscription.session, arena, change)
 
     def _show_present(self, name: str) -> None:
         """Fill the fields with the settings of a camera that was selected."""
@@ -250,17 +250,15 @@ class CameraSettings:
         return f"{name}, {image.shape[1]} x {image.shape[0]}"
 
     def _request_picture(self, name: str) -> NDArray[np.uint8]:
-        """The current image of a camera, (h, w, 3) RGB; raises NetworkError if there is none."""
+        """The current image of a camera, (h, w, 3) RGB; raises as `request_snapshot`."""
         image = decode_jpeg(self._subscription.snapshot(name))
         if image is None:
-            raise NetworkError(f"{name} sent no image within {REQUEST_TIMEOUT_S:.0f} s")
+            raise NetworkError(f"{name} sent no JPEG image; is it of this version of Roundel?")
         return image
 
 
-def decode_jpeg(data: bytes | None) -> NDArray[np.uint8] | None:
+def decode_jpeg(data: bytes) -> NDArray[np.uint8] | None:
     """Decode a JPEG to (h, w, 3) RGB; return None for anything else."""
-    if not data:
-        return None
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:

@@ -26,9 +26,9 @@ from web.scene.clicks import nearest_to_ray
 from web.scene.markers import add_points, show_points
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
+from web.tables import STALE_S
 from web.widgets import GREY, PRIMARY, ActionButton, Answer, set_content, set_property
 
-MARKERS_S = 1.0  # age up to which markers can be selected: one may be missing in single messages
 MEASURE_S = 1.5  # for which the markers of the new robot are measured
 SAME_M = 0.05  # distance up to which a measured marker is the selected one
 NOTHING_SEEN = "no unlabeled marker in view: place the robot, markers up, where two cameras see it"
@@ -47,7 +47,8 @@ class MarkerPicker:
         self.selected: list[Array] = []  # positions (3,), world
         self._subscription = subscription
         self._unlabeled = np.empty((0, 3))  # positions of unlabeled markers that several cameras saw lately
-        self._seen_lately: dict[float, Array] = {}  # by the time of their message, the feed's seconds
+        # By the time of their message, the feed's seconds: a marker may be missing in single messages.
+        self._seen_lately: dict[float, Array] = {}
         self._active = False
         place = server.gui.add_folder("New robot")
         with place:
@@ -76,11 +77,11 @@ class MarkerPicker:
     def update(self, state: ArenaState) -> None:
         """Store the current unlabeled markers, and draw the selected ones."""
         timed = state.markers
-        if timed is not None and state.age_s(timed) < MARKERS_S:
+        if timed is not None and state.age_s(timed) < STALE_S:
             rows = timed.message.unlabeled()
             self._seen_lately[timed.received_s] = timed.message.positions()[rows]
             set_content(self._seen, small(describe_unlabeled(timed.message.diameters()[rows])))
-        self._seen_lately = {s: at for s, at in self._seen_lately.items() if state.now_s - s < MARKERS_S}
+        self._seen_lately = {s: at for s, at in self._seen_lately.items() if state.now_s - s < STALE_S}
         self._unlabeled = np.vstack([np.empty((0, 3)), *self._seen_lately.values()])
         is_next = next_step(state) == "robots"
         set_property(self._button, "color", PRIMARY if is_next and not self.selected else GREY)

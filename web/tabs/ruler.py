@@ -11,11 +11,11 @@ from web.colours import SELECTED, to_linear
 from web.html_tables import small
 from web.scene.clicks import nearest_to_ray
 from web.state.feed import ArenaState
+from web.tables import STALE_S
 from web.widgets import GREY, set_content, set_property
 
 MEASURE, STOP = "Measure a distance", "Stop measuring"
 FOLLOW_M = 0.05  # that a marker may move from one drawing to the next
-MARKERS_S = 1.0  # age up to which markers are measured
 THICKNESS_M = 0.006
 
 
@@ -47,7 +47,7 @@ class Ruler:
     def update(self, state: ArenaState) -> None:
         """Follow the selected markers, and show their distance with its standard deviation."""
         timed = state.markers
-        if timed is None or state.age_s(timed) > MARKERS_S:
+        if timed is None or state.age_s(timed) > STALE_S:
             self._markers = np.empty((0, 3))
             return
         self._markers = timed.message.positions()

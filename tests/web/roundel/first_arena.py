@@ -51,7 +51,6 @@ MARKERS = [[0.1, 0.0, 0.0], [-0.08, 0.05, 0.0], [-0.03, -0.11, 0.0]]  # of the r
 STEP_MS = 60_000  # for the page to show the outcome of a step, on a loaded machine
 CALIBRATION_MS = 150_000
 LONG_ENOUGH = r"^(3[6-9]|[4-9]\d|1\d\d) s[:;]"  # three rounds of the wand
-START_S = 5.0  # of a camera's program
 MAX_TIMES = 2.0  # that phases are longer on a loaded machine
 N_POSES = 500  # two rounds at 20 a second
 HEIGHT_M = 0.15  # of the robot's markers above the floor
@@ -288,17 +287,20 @@ class FirstArena:
             self.up = self._start(SERVER, stack, "up", "lab", "--port", self.port, "--source", *folders)
             self.camera = self._start(CAMERAS, stack, "camera", "--source", *videos)
             self._stack = stack.pop_all()
-        self._started_s = time.monotonic()
         return self
 
     def begin_s(self, k: int) -> float:
         """When a phase begins, seconds after the recordings."""
         return self.times * sum(phase.seconds for phase in PHASES[:k])
 
+    def begin(self) -> None:
+        """The cameras play: the phases of the recordings are counted from here."""
+        self._began_s = time.monotonic()
+
     def wait_for_body(self, body: str) -> None:
-        """Wait until its first phase has begun, if the cameras have started within `START_S`."""
-        begin_s = self.begin_s(next(k for k, phase in enumerate(PHASES) if phase.body == body)) + START_S
-        wait_for(lambda: time.monotonic() - self._started_s > begin_s, deadline_s=begin_s)
+        """Wait until its first phase has begun."""
+        begin_s = self.begin_s(next(k for k, phase in enumerate(PHASES) if phase.body == body))
+        wait_for(lambda: time.monotonic() - self._began_s > begin_s, deadline_s=begin_s)
 
     def __exit__(self, *exception: object) -> None:
         self._stack.close()
@@ -393,6 +395,7 @@ class Outcome:
         circle: through the positions that the program printed while the robot drove.
         n_poses: their number.
         clicks: of the operator.
+        seconds: from the open page to the last pose.
     """
 
     calibration: str
@@ -400,6 +403,7 @@ class Outcome:
     circle: Circle
     n_poses: int
     clicks: int
+    seconds: float
 
 
 def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]) -> Outcome:
@@ -412,13 +416,16 @@ def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]
     """
     with arena.browsing() as page:
         picture(page, "begin")
+        opened_s = time.monotonic()
         operator = Operator(page, arena.wait_for_body, lambda name: picture(page, name))
         operator.check_cameras()
+        arena.begin()
         calibration = operator.calibrate()
         operator.define_floor()
         operator.define_robot(ROBOT)
         code = operator.program()
         lines = arena.run_program(code, lambda lines: len(driven(*read_poses(lines))[0]) > N_POSES)
+        seconds = time.monotonic() - opened_s
         t_ns, positions = driven(*read_poses(lines))
         picture(page, "status")
     rig = load_rig(folder / "lab" / "rig.yaml")
@@ -428,6 +435,7 @@ def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]
         fit_circle(t_ns, positions),
         len(t_ns),
         operator.clicks,
+        seconds,
     )
 
 
