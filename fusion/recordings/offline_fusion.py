@@ -288,7 +288,9 @@ def require_held(recording: ArenaRecording, path: Path, **held: object) -> None:
     """Raise ConfigError unless the recording or an option gives each of `held`, named as its option is."""
     if lacks := [name for name, value in held.items() if not value]:
         options = " and ".join(f"--{name} {name}.yaml" for name in lacks)
-        raise ConfigError(f"{path} holds no {' and no '.join(lacks)}{skipped(recording.faults)}; give {options}")
+        raise ConfigError(
+            f"{path} holds no {' and no '.join(lacks)}{skipped(recording.faults)}; give {options}"
+        )
 
 
 def write_recording(source: Path, out: Path, fused: Iterable[TrackingResult]) -> None:

@@ -84,6 +84,18 @@ def test_only_markers_that_are_stationary_and_seen_often_are_measured():
     assert len(markers.within((0.5, 0.3, 0.2), 0.1).position) == 0
 
 
+def test_a_robot_that_is_lost_for_moments_is_no_new_one():
+    """The server lost robot a in two thirds of the messages: only the markers of the other are new."""
+    motions = {"a": line((0.6, -0.5, 0.2)), "b": WIDE_MOTION}
+    arena = Arena({"a": TRIANGLE, "b": WIDE}, motions, sigma_px=0.05)
+    lost = markers_of(arena, 20, LARGE)
+    known = Arena({"a": TRIANGLE}, {"a": motions["a"]}, arena.cameras)
+    found = [fused.markers for fused in track(known, arena.frames(30))][-10:]
+    assert len(find_stationary_markers(lost).position) == 6
+    assert all((message.robot_index() >= 0).sum() == 3 for message in found)
+    assert len(find_stationary_markers([*lost, *found]).position) == 3
+
+
 @pytest.mark.parametrize(
     ("phases", "declared"),
     [((0.0,) * 8, LARGE), ((0.0, 0.27, -0.41, 0.38, 0.1, -0.2, 0.45, -0.33), SIMILAR)],

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The subscription requests the rig, snapshots and undo, and reports a missing answer."""
 
+from itertools import count
+
 import numpy as np
 import pytest
 import zenoh
@@ -10,7 +12,8 @@ from calib.rig.rig_messages import RigMessage, undo_rig_key
 from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.server_connection import ServerConnection
-from tests.waiting import wait_for
+from fusion.client.robot_definition import find_stationary_markers
+from tests.waiting import repeating, wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.state.feed import Feed
 from web.state.subscription import Subscription
@@ -47,6 +50,17 @@ def test_a_snapshot_is_the_camera_s_answer(arena: LiveArena, subscription: Subsc
     queryable = arena.session.declare_queryable(key, lambda query: query.reply(key, data))
     assert subscription.snapshot("north") == data
     queryable.undeclare()
+
+
+def test_frame_sets_that_locate_nothing_do_not_hide_a_marker(arena: LiveArena, subscription: Subscription):
+    """Of one message in ten: a busy machine fuses the frames of single cameras. Before, such a marker "moves or is not
+    visible"."""
+    sent = count()
+    with repeating(
+        lambda: arena.markers([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)][: 1 + (next(sent) % 10 == 0)]), 0.01
+    ):
+        messages = subscription.collect_markers(0.5)
+    assert find_stationary_markers(messages).position == pytest.approx(np.array([[1, 0, 0]]))
 
 
 def test_undo_returns_the_server_s_answer(arena: LiveArena, subscription: Subscription):
