@@ -6,7 +6,12 @@ import html
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
+from calib.rig.coverage import Coverage
+
 COLOURS = {"ok": "#40c8aa", "warn": "#f0a63a", "bad": "#ef5b5b", "wait": "#9aa0ac"}  # by level
+POINTS_PER_SHADE, SHADES = 8, 4  # of a cell, by the logarithm of its number of points
 MARGIN_PX = 10
 CELL = "padding:3px 6px 3px 0"
 # On a phone Viser lays its panel, 20em wide, over the lower part of the scene. Here both are in one column: the scene
@@ -88,12 +93,29 @@ class HtmlTable:
         )
 
 
-def picture_grid(pictures: Iterable[tuple[str, str, str, bytes]]) -> str:
-    """Pictures side by side: what each shows, its caption, its type (png or jpeg) and its data."""
+def picture(text: str, jpeg: bytes) -> str:
+    """A picture, and what it shows."""
+    data = base64.b64encode(jpeg).decode()
+    return f'<img alt="{html.escape(text)}" decoding="sync" src="data:image/jpeg;base64,{data}">'
+
+
+def draw_cells(coverage: Coverage, text: str) -> str:
+    """The cells of an image, brighter with more points, and what they show."""
+    columns = coverage.counts.shape[1]
+    shades = np.minimum(SHADES, np.ceil(np.log2(coverage.counts / POINTS_PER_SHADE + 1))) / SHADES
+    style = f"display:grid;grid-template-columns:repeat({columns},1fr);gap:2px;margin:4px {MARGIN_PX}px"
+    cells = "".join(
+        f'<div style="height:12px;background:{COLOURS["ok"]}{round(20 + 235 * shade):02x}"></div>'
+        for shade in shades.ravel()
+    )
+    return f'<div title="{html.escape(text)}" style="{style}">{cells}</div>'
+
+
+def picture_grid(pictures: Iterable[tuple[str, str]]) -> str:
+    """Pictures side by side: the HTML and the caption of each."""
     figures = "".join(
-        f'<figure><img alt="{html.escape(text)}" decoding="sync" src="data:image/{kind};base64,'
-        f'{base64.b64encode(data).decode()}"><figcaption>{html.escape(caption)}</figcaption></figure>'
-        for text, caption, kind, data in pictures
+        f"<figure>{drawn}<figcaption>{html.escape(caption)}</figcaption></figure>"
+        for drawn, caption in pictures
     )
     return f'<div class="roundel-pictures">{figures}</div>' if figures else ""
 

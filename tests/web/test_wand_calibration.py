@@ -82,7 +82,7 @@ def test_a_wand_session_in_the_page_calibrates_the_cameras(
             session.put(key, encode(message), congestion_control=zenoh.CongestionControl.BLOCK)
         for name in ARENA.truth.cameras:
             page.get_by_text(name).first.wait_for()
-        wait_for(lambda: sum(picture.share for picture in view.feed.state().coverage.values()))
+        wait_for(lambda: sum(coverage.share() for coverage in view.feed.state().coverage.values()))
         assert "wave where" in panel.next_action()
         page.get_by_role("button", name="End wand session").click()
         wait_for(lambda: "wait for its calibration" in panel.next_action())

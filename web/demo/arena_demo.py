@@ -379,7 +379,7 @@ def describe_calibration_step(clock: SceneClock, state: ArenaState) -> str:
         return f"the wand session is over; calibrating ({t_s - wave_s:.0f} s)"
     if t_s < 0:
         return f"starting programs; the wand session begins in {-t_s:.0f} s"
-    shares = ", ".join(f"{name} {100 * c.share:.0f} %" for name, c in sorted(state.coverage.items()))
+    shares = ", ".join(f"{name} {100 * c.share():.0f} %" for name, c in sorted(state.coverage.items()))
     return f"waving the wand, {t_s:.0f} of {wave_s:.0f} s; image coverage: {shares or 'no camera yet'}"
 
 

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import msgspec
 import numpy as np
 
@@ -40,10 +39,6 @@ REMOVED_CAMERA_S = 5.0  # the same of a camera without a status
 MAX_PENDING = 1024  # keys whose latest message is not decoded yet
 COVERAGE_S = 0.1  # shortest time between two frames of a camera that extend its coverage
 MAX_REASONS = 32  # distinct faults; the feed counts further ones as "others"
-WIDTH = 160  # pixels of one picture of the coverage
-MAX_ASPECT = 4.0  # height over width of one picture
-CELLS = (8, 8)  # of the grid for the covered share
-EMPTY, COVERED = np.array([38, 28, 24], np.uint8), np.array([170, 200, 64], np.uint8)  # blue, green, red
 _CONTAINERS = (
     "poses",
     "cameras",
@@ -55,41 +50,6 @@ _CONTAINERS = (
     "faults",
 )
 Vector = tuple[float, float, float]
-
-
-class CoveragePicture:
-    """A picture of one camera's image that shows where roundels were detected, and where the wand is still missing."""
-
-    def __init__(self, width: int, height: int) -> None:
-        self.size = (width, height)
-        self._mask = np.zeros((max(1, round(WIDTH * min(height / width, MAX_ASPECT))), WIDTH), bool)
-        self._coverage = Coverage(np.zeros(CELLS, np.int64))
-
-    def add(self, detections: Detections) -> None:
-        """Mark the roundels of one frame."""
-        uv = np.frombuffer(detections.uv, "<f8").reshape(-1, 2)
-        self._coverage += Coverage.of(uv, *self.size, CELLS)
-        relative = (uv + 0.5) / self.size
-        relative = relative[((relative >= 0) & (relative < 1)).all(axis=1)]
-        rows, columns = self._mask.shape
-        v, u = (relative[:, 1] * rows).astype(int), (relative[:, 0] * columns).astype(int)
-        for dv in (-1, 0, 1):
-            for du in (-1, 0, 1):
-                self._mask[np.clip(v + dv, 0, rows - 1), np.clip(u + du, 0, columns - 1)] = True
-
-    @property
-    def n_marked(self) -> int:
-        """Number of marked pixels; it grows with each change of the picture."""
-        return int(np.count_nonzero(self._mask))
-
-    @property
-    def share(self) -> float:
-        """The covered share of the image, 0 to 1, counted in 8 x 8 cells."""
-        return self._coverage.share()
-
-    def png(self) -> bytes:
-        """Return the picture, 160 pixels wide."""
-        return cv2.imencode(".png", np.where(self._mask[..., None], COVERED, EMPTY))[1].tobytes()
 
 
 @dataclass(frozen=True)
@@ -110,7 +70,7 @@ class ArenaState:
     cameras: dict[str, TimedMessage] = field(default_factory=dict)  # status of each camera
     previews: dict[str, TimedMessage] = field(default_factory=dict)  # picture of each camera
     detections: dict[str, Detections] = field(default_factory=dict)  # latest of each camera
-    coverage: dict[str, CoveragePicture] = field(default_factory=dict)  # by camera
+    coverage: dict[str, Coverage] = field(default_factory=dict)  # by camera: where it saw roundels
     relative: dict[str, TimedMessage] = field(default_factory=dict)  # what each camera locates by itself
     markers: TimedMessage | None = None
     status: TimedMessage | None = None  # of the server
@@ -294,18 +254,19 @@ class Feed:
                     messages.pop(camera, None)
 
     def _add_coverage(self, detections: Detections, key: str) -> None:
-        camera, size = detections.camera, (detections.width, detections.height)
+        camera, before = detections.camera, self._state.detections.get(detections.camera)
         _check_name(self._state.coverage, camera, key)
-        if camera not in self._state.detections:  # later frames are counted when they arrive
+        if before is None:  # later frames are counted when they arrive
             self._state.message_counts[f"frames {camera}"] += 1
         self._state.detections[camera] = detections
-        picture = self._state.coverage.get(camera)
-        if picture is None or picture.size != size:
-            picture = self._state.coverage[camera] = CoveragePicture(*size)
-        elif self._received_s - self._covered_s.get(camera, -math.inf) < COVERAGE_S:
+        if self._received_s - self._covered_s.get(camera, -math.inf) < COVERAGE_S:
             return
         self._covered_s[camera] = self._received_s
-        picture.add(detections)
+        size = detections.width, detections.height
+        covered = Coverage.of(np.frombuffer(detections.uv, "<f8"), *size)
+        if before is not None and size == (before.width, before.height) and camera in self._state.coverage:
+            covered += self._state.coverage[camera]
+        self._state.coverage[camera] = covered
 
     def _store_rig(self, message: RigMessage, key: str) -> None:
         state = self._state

@@ -21,7 +21,7 @@ from camera_node.protocol.registration import CameraChange
 from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.session import guarded
 from web.errors import WebError
-from web.html_tables import picture_grid
+from web.html_tables import draw_cells, picture, picture_grid
 from web.own_control import OwnControl, each_browser
 from web.scene.camera_frustums import CameraDrawing
 from web.state.feed import ArenaState
@@ -52,19 +52,16 @@ class CameraTable:
         self._coverage_folder = gui.add_folder("Wand coverage", visible=False)
         with self._coverage_folder:
             self._coverage = gui.add_html("")
-        self._marked: dict[str, int] = {}  # pixels of the pictures that are shown
 
     def update(self, state: ArenaState) -> None:
         """Show the state."""
         set_content(self._table, tabulate_cameras(state).html())
         calibrated = state.rig is not None and bool(state.rig.placed())
         set_property(self._coverage_folder, "visible", bool(state.coverage) and not calibrated)
-        marked = {name: picture.n_marked for name, picture in state.coverage.items()}
-        if self._coverage_folder.visible and marked != self._marked:
-            self._marked = marked
+        if self._coverage_folder.visible:
             pictures = (
-                (f"where {name} saw roundels", f"{name}: {picture.share:.0%}", "png", picture.png())
-                for name, picture in sorted(state.coverage.items())
+                (draw_cells(coverage, f"where {name} saw roundels"), f"{name}: {coverage.share():.0%}")
+                for name, coverage in sorted(state.coverage.items())
             )
             set_content(self._coverage, picture_grid(pictures))
 
@@ -102,11 +99,11 @@ class LivePictures:
         self._subscription.watch_previews(False)
 
 
-def _describe(preview: Preview, state: ArenaState) -> tuple[str, str, str, bytes]:
+def _describe(preview: Preview, state: ArenaState) -> tuple[str, str]:
     """A camera's picture for `picture_grid`, with the number of its roundels."""
     name = preview.camera
     seen = len(state.detections[name]) if name in state.detections else 0
-    return name, f"{name}: {preview.width} x {preview.height}, {seen} roundels", "jpeg", preview.jpeg
+    return picture(name, preview.jpeg), f"{name}: {preview.width} x {preview.height}, {seen} roundels"
 
 
 class CameraSettings:

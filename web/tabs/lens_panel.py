@@ -20,10 +20,9 @@ from calib.intrinsics.guided_capture import CaptureProgress, capture_views
 from calib.intrinsics.images import take_snapshots
 from calib.intrinsics.lens_calibration import BoardViews, CalibratedLens, Model, merge_lenses
 from calib.intrinsics.residual_plot import draw_residuals
-from calib.rig.coverage import Coverage
 from calib.rig.rig import Rig
 from web.errors import WebError
-from web.html_tables import COLOURS, MARGIN_PX, small
+from web.html_tables import draw_cells, small
 from web.own_control import OwnControl, each_browser
 from web.state.feed import ArenaState
 from web.state.subscription import Subscription
@@ -35,7 +34,6 @@ MODELS = ("pinhole", "fisheye")
 WIDE = "fisheye for lenses beyond 120 degrees"
 CAPTURE_S = 180.0
 CLOSE_S = 5.0
-CORNERS_PER_SHADE, SHADES = 8, 4  # of a cell, by the logarithm of its number of corners
 LABELS = ("Calibrate the lens with a board", "End, and calibrate")
 BOARD_HINT = (
     "charuco:COLUMNSxROWS:SQUARE_M as roundel print board writes it, or chessboard:COLUMNSxROWS:SQUARE_M"
@@ -126,7 +124,7 @@ class LensPanel:
         return summarize_lens(name, lens)
 
     def _show(self, progress: CaptureProgress) -> None:
-        set_content(self._cells, draw_cells(progress.coverage))
+        set_content(self._cells, draw_cells(progress.coverage, "where the board was seen"))
         self._answer.show(f"{progress.summary}; {progress.figures}; {progress.advice}")
 
     def _show_residuals(self, name: str, lens: CalibratedLens) -> None:
@@ -134,18 +132,6 @@ class LensPanel:
         with inside(self._folder):
             picture = np.ascontiguousarray(cv2.cvtColor(drawn, cv2.COLOR_BGR2RGB), np.uint8)
             self._residuals = self._server.gui.add_image(picture, label="residuals", format="jpeg")
-
-
-def draw_cells(coverage: Coverage) -> str:
-    """The cells of the image as HTML, brighter with more corners of the board."""
-    columns = coverage.counts.shape[1]
-    shades = np.minimum(SHADES, np.ceil(np.log2(coverage.counts / CORNERS_PER_SHADE + 1))) / SHADES
-    style = f"display:grid;grid-template-columns:repeat({columns},1fr);gap:2px;margin:4px {MARGIN_PX}px"
-    cells = "".join(
-        f'<div style="height:12px;background:{COLOURS["ok"]}{round(20 + 235 * shade):02x}"></div>'
-        for shade in shades.ravel()
-    )
-    return f'<div title="where the board was seen" style="{style}">{cells}</div>'
 
 
 def summarize_lens(name: str, lens: CalibratedLens) -> str:

@@ -25,7 +25,7 @@ def test_messages_are_stored(arena: LiveArena, feed: Feed):
     assert state.cameras["north"].message.dropped == 2
     assert state.status is not None
     assert state.status.message.cameras["north"].assigned == 200
-    assert state.coverage["north"].share == 2 / 64
+    assert state.coverage["north"].share() == 2 / 48
     assert state.message_counts["frames north"] == 1
     assert not state.faults
 
