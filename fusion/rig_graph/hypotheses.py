@@ -123,6 +123,11 @@ class Hypothesis:
         begin = np.zeros((n_cameras, ERRORS)) if start is None else np.where(free, start, 0.0)
         return cls(cause, tuple(cameras), free, begin)
 
+    @property
+    def odds(self) -> float:
+        """Twice the logarithm of how much less probable errors of all cameras are than one camera at fault."""
+        return float(chdtri(2, RIVAL)) if self.scale != 1.0 else 0.0
+
     def is_part_of(self, other: "Hypothesis") -> bool:
         """Whether the other one frees all that this one does."""
         return bool((self.free <= other.free).all()) and self.scale in (1.0, other.scale)
@@ -261,9 +266,9 @@ def judge(window: Window, starts: Array) -> Verdict:
     """
     n = len(window.names)
     none = fit(window, Hypothesis.of(None, (), n))
-    if not is_contradicted(none, n):
-        return Verdict(None, (), none, scale=_scaled(window, none).hypothesis.scale)
     scaled = _scaled(window, none)
+    if not is_contradicted(none, n):
+        return Verdict(None, (), none, scale=scaled.hypothesis.scale)
     verdict = replace(_compare(window, [none, scaled], starts), misfit=none.misfit)
     return verdict if verdict.cause else replace(verdict, scale=scaled.hypothesis.scale)
 
@@ -327,31 +332,26 @@ def decide(fits: Sequence[Fit], n_cameras: int) -> Verdict:
     """Accept the best hypothesis if it beats all others, and if a majority of the cameras is not at fault.
 
     A hypothesis that frees more than the best one is no rival: it contains that one, and its penalty says that it
-    explains no more. A rival that blames no camera, but the scale of all errors, is refuted by `RIVAL`.
+    explains no more. One camera at fault is more probable than larger errors of all, by `RIVAL`;
+    only cameras that can be found at fault refute these.
     """
     variance = min(f.variance for f in fits)
-    score = {id(f): f.cost / variance + f.penalty for f in fits}
+    score = {id(f): f.cost / variance + f.penalty + f.hypothesis.odds for f in fits}
     best = min(fits, key=lambda f: score[id(f)])
-    margin = {
-        True: chdtri(CAUSES["pose"].stop, FALSE_ALARM),
-        False: chdtri(2, RIVAL),
-    }  # whether it blames a camera
+    limit = score[id(best)] + chdtri(CAUSES["pose"].stop, FALSE_ALARM)
     rivals = [
         f
         for f in fits
         if not best.hypothesis.is_part_of(f.hypothesis)
-        and score[id(f)] < score[id(best)] + margin[bool(f.hypothesis.cameras)]
+        and not f.hypothesis.odds
+        and score[id(f)] < limit
+        and (not best.hypothesis.odds or 2 * len(f.hypothesis.cameras) < n_cameras)
     ]
     cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
     if not rivals and 2 * len(cameras) < n_cameras:
         return Verdict(cause, cameras, best)
-    possible = [f.hypothesis for f in (best, *rivals)]
-    named = (
-        range(n_cameras)
-        if any(h.scale != 1.0 for h in possible)
-        else {k for h in possible for k in h.cameras}
-    )
-    return Verdict(None, tuple(sorted(named)), best)
+    named = {k for f in (best, *rivals) for k in f.hypothesis.cameras}
+    return Verdict(None, tuple(range(n_cameras) if best.hypothesis.odds else sorted(named)), best)
 
 
 def _suspects(poses: Sequence[Fit]) -> list[int]:

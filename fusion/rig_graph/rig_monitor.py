@@ -83,6 +83,7 @@ class RigMonitor:
         excluded: names of moved cameras whose poses are not known yet.
         pinned: names of cameras whose poses a user confirmed; these do not change.
         contradicting: names of the cameras of which some are at fault, but the data do not decide which.
+        is_settled: whether the last `check` judged what contradicts the predictions: no clock is searched for.
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
     """
 
@@ -102,6 +103,7 @@ class RigMonitor:
         self._scale = (
             1.0  # of the rig's errors, accepted; claims may count them larger while nothing is decided
         )
+        self.is_settled = False
         self.executor: Executor | None = None
         self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
         self.excluded: set[str] = set()
@@ -177,6 +179,7 @@ class RigMonitor:
             is_doubtful: whether the frame set contradicts the predictions. When that begins, something changed: the
                 keyframes before do not show what is now.
         """
+        self.is_settled = False
         if is_doubtful and not self._was_doubtful:
             self._forget()
         self._was_doubtful = is_doubtful
@@ -214,10 +217,13 @@ class RigMonitor:
         self, window: Window, verdict: Verdict, measured: Measured | None, recalibrates: bool
     ) -> tuple[ExtrinsicsCorrection, ...]:
         names = tuple(window.names[k] for k in verdict.cameras)
+        self.is_settled = verdict.cause != "clock"
         self._note_clocks(verdict, measured)
         is_open = verdict.is_of_rig or (bool(names) and verdict.cause is None)
         self._n_undecided = self._n_undecided + 1 if is_open else 0
-        if self._n_undecided == 1:  # keyframes from before the change may make any hypothesis look right
+        if (
+            self._n_undecided == 1 and not self._was_doubtful
+        ):  # keyframes from before make anything look right
             self._keyframes.clear()
         self._is_contradicted = bool(names) or self._n_undecided == 1
         if verdict.cause is None:

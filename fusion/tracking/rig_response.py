@@ -49,20 +49,15 @@ class RigResponse:
         rows, before = list(same), list(same.values())
         self.responses[rows], self.counted[rows] = old.responses[before], old.counted[before]
 
-    def update(self, fitted: RobustFit, added_px2: float) -> None:
-        """Follow a step of the filter.
-
-        Args:
-            fitted: of all robots.
-            added_px2: variance that the detections of a camera have in common beside the calibration's error.
-        """
+    def update(self, fitted: RobustFit) -> None:
+        """Follow a step of the filter, whose added noise the detections of a camera have in common."""
         prediction, equations = fitted.prediction, (fitted.equations, fitted.weights)
         self._follow(
             fitted.states,
             fitted.observations,
             equations,
             (prediction.information, prediction.motion),
-            added_px2,
+            fitted.added_px2,
         )
 
     def forget(self, rows: Index) -> None:
@@ -120,7 +115,7 @@ class RigResponse:
 
         Args:
             P: (N, 12, 12) the filter's.
-            added_px2: see `update`.
+            added_px2: variance that the detections of a camera may have in common beside the calibration's error.
         """
         return _core.consider(P, self.counted, self.responses, self._factor_with(added_px2))
 

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion import _core
 from fusion.model.observations import (
     Assignments,
     DetectionTable,
@@ -28,7 +27,7 @@ from fusion.model.observations import (
 )
 from fusion.model.states import POSITION, States
 from fusion.model.undistortion import COV
-from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault
+from fusion.monitoring.residual_monitor import LEARNED, ResidualMonitor, camera_at_fault
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
 
@@ -47,9 +46,11 @@ class RobustFit:
 
     Attributes:
         prediction: the robots before the update.
-        detections: of the frame set, with the noise that the fit gives them.
-        observations, equations, weights: of the assignments, row by row; see `BodyFit`.
+        detections: of the frame set.
+        observations, equations, weights: of the assignments, row by row, with the noise that the fit gives them; see
+            `BodyFit`.
         cost, count: (R,) of each robot: its fit, as of `BodyFit`, and its detections.
+        added_px2: variance that the fit gave the detections beside their own noise.
     """
 
     states: States
@@ -61,6 +62,7 @@ class RobustFit:
     weights: Array
     cost: Array
     count: Index
+    added_px2: float
 
 
 class RobustUpdate:
@@ -89,29 +91,46 @@ class RobustUpdate:
         """Whether the last frame set contradicted the predictions."""
         return self._left_out is not None or self.added_px2 > 0
 
+    def settle(self) -> None:
+        """The rig graph judged what the detections contradict: what is usual from now on is learnt."""
+        self._residuals, self._left_out, self.added_px2 = ResidualMonitor(), None, 0.0
+
     def update(
         self, prediction: Prediction, detections: DetectionTable, assignments: Assignments
     ) -> RobustFit:
         """The updated states, and the assignments that fit."""
-        fitted, last_px2 = self._fit(prediction, detections, assignments), self.added_px2
-        self.added_px2 = 0.0
+        fitted = self._fit(prediction, detections, assignments)
+        self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
         if (again := self._left_out_again(fitted, assignments)) is not None:
             fitted = again
         elif not self._is_unusual(fitted):
             self._left_out = None
-            self._residuals.learn(fitted.assignments.squared_px, fitted.cost, fitted.count)
+            if self.added_px2:
+                fitted = self._fit(prediction, detections, assignments, self.added_px2)
+            else:
+                self._residuals.learn(fitted.assignments.squared_px, fitted.cost, fitted.count)
         else:
-            fitted = self._leave_one_out(fitted, assignments) or self._with_noise(
-                fitted, assignments, last_px2
-            )
+            fitted = self._leave_one_out(fitted, assignments) or self._with_noise(fitted, assignments)
         return self._without_incompatible(fitted)
+
+    @staticmethod
+    def _least_px2(fitted: RobustFit) -> float:
+        """Less noise than detections have themselves changes nothing."""
+        return float(fitted.detections.variance_px2.mean()) if len(fitted.detections) else 0.0
 
     def _is_unusual(self, fitted: RobustFit) -> bool:
         return self._residuals.is_unusual(fitted.cost, fitted.count)
 
-    def _fit(self, prediction: Prediction, detections: DetectionTable, assignments: Assignments) -> RobustFit:
+    def _fit(
+        self,
+        prediction: Prediction,
+        detections: DetectionTable,
+        assignments: Assignments,
+        added_px2: float = 0.0,
+    ) -> RobustFit:
         """The updated states; a robot that its detections contradict stays as predicted and loses them."""
-        observations = MatchedObservations.of(assignments, detections, self._markers)
+        noisy = detections.replaced(COV, detections.cov + added_px2 * np.eye(2)[:, :, None])
+        observations = MatchedObservations.of(assignments, noisy if added_px2 else detections, self._markers)
         observations = self._estimator.prepared(prediction.states, observations)
         fitted = self._estimator.fit(prediction, observations)
         states, assignments = fitted.states, assignments.with_residuals(fitted.squared_px)
@@ -125,9 +144,8 @@ class RobustUpdate:
             assignments, observations = assignments.select(kept), observations.select(kept)
             equations, weights = equations[kept], weights[kept]
         count = np.bincount(body, minlength=n)
-        return RobustFit(
-            states, assignments, prediction, detections, observations, equations, weights, fitted.cost, count
-        )
+        fit = assignments, prediction, detections, observations, equations, weights, fitted.cost, count
+        return RobustFit(states, *fit, added_px2)
 
     def _without(self, k: int, fitted: RobustFit, assignments: Assignments) -> RobustFit:
         camera = fitted.detections.camera[assignments.detection]
@@ -151,37 +169,32 @@ class RobustUpdate:
             None if self._left_out is None or self._is_unusual(fits[self._left_out]) else fits[self._left_out]
         )
 
-    def _with_noise(self, fitted: RobustFit, assignments: Assignments, last_px2: float) -> RobustFit:
-        """The fit with as much noise as makes it usual, not much less than the frame set before had."""
-        self.added_px2 = max(last_px2 / 2, float(fitted.detections.variance_px2.mean()))
+    def _with_noise(self, fitted: RobustFit, assignments: Assignments) -> RobustFit:
+        """The fit with as much noise as makes it usual, no less than the frame set before had."""
+        self.added_px2 = max(self.added_px2, self._least_px2(fitted))
         while self._is_unusual(
-            again := self._fit(fitted.prediction, self.noisy(fitted.detections), assignments)
+            again := self._fit(fitted.prediction, fitted.detections, assignments, self.added_px2)
         ):
             self.added_px2 *= 2
             if self.added_px2 > MAX_ADDED_PX2:
                 break
         return again
 
-    def noisy(self, detections: DetectionTable) -> DetectionTable:
-        """Detections with the noise that the last update gave them."""
-        cov = detections.cov + self.added_px2 * np.eye(2)[:, :, None]
-        return detections.replaced(COV, cov) if self.added_px2 else detections
-
     def _without_incompatible(self, fitted: RobustFit) -> RobustFit:
         """The fit to detections that do not contradict the others of their robots; all keep their residuals.
 
         A robot whose compatible detections fit already stays as it is: the others have hardly any weight.
         """
-        slack_px = float(np.hypot(self._residuals.slack_px, np.sqrt(self.added_px2)))
+        slack_px2 = self._residuals.slack_px**2, fitted.added_px2
         detections, robot = fitted.detections, self._markers.robot[fitted.assignments.marker]
-        suspicious = fitted.assignments.squared_px > SUSPICIOUS * slack_px**2
+        suspicious = fitted.assignments.squared_px > SUSPICIOUS * sum(slack_px2)
         if not suspicious.any():
             return fitted
         rows = np.flatnonzero(self._may_be_displaced(fitted, robot[suspicious])[robot])
         if not len(rows):
             return fitted
         observations = MatchedObservations.of(fitted.assignments.select(rows), detections, self._markers)
-        compatible = jointly_compatible(self._estimator, fitted.prediction, observations, slack_px)
+        compatible = jointly_compatible(self._estimator, fitted.prediction, observations, *slack_px2)
         displaced = np.intersect1d(robot[rows[~compatible]], robot[rows[compatible & suspicious[rows]]])
         if not len(displaced):
             return fitted
@@ -210,7 +223,11 @@ MAX_DEVIATION = 13.8  # chi-square with 2 degrees of freedom, one in a thousand,
 
 
 def jointly_compatible(
-    estimator: Estimator, prediction: Prediction, observations: MatchedObservations, slack_px: float
+    estimator: Estimator,
+    prediction: Prediction,
+    observations: MatchedObservations,
+    slack_px2: float,
+    common_px2: float,
 ) -> Mask:
     """(N,) the observations that agree with the prediction and the other ones of their bodies.
 
@@ -218,26 +235,33 @@ def jointly_compatible(
         estimator: of the bodies.
         prediction: of the bodies.
         observations: N of them, which the prediction shows.
-        slack_px: standard deviation of calibration errors, in quadrature to the noise.
+        slack_px2: variance of calibration errors beside the noise.
+        common_px2: variance of an error that all detections of a camera share, as by its turn.
     """
     observations = estimator.with_time_errors(prediction.states, observations)
     A, nu = estimator.innovations(prediction.states, observations)
     variance = observations.detections.variance_px2
-    share = np.sqrt(variance / (variance + slack_px**2))[:, None]
+    share = np.sqrt(variance / (variance + slack_px2))[:, None]
     A, nu = A.reshape(-1, 2, 12) * share[:, :, None], nu.reshape(-1, 2) * share
+    cameras, seen_by = np.unique(observations.detections.camera, return_inverse=True)
+    turns = np.eye(2 * len(cameras)).reshape(-1, 2, 2 * len(cameras))[seen_by]
+    A = np.concatenate([A, turns * np.sqrt(common_px2 / (variance + slack_px2))[:, None, None]], 2)
+    n = A.shape[2]
     order = np.argsort(observations.discs.body, kind="stable")
     bodies, first, count = np.unique(observations.discs.body[order], return_index=True, return_counts=True)
     row = np.repeat(np.arange(len(bodies)), count)
     at = row, np.arange(len(order)) - first[row]
-    tables = np.zeros((len(bodies), int(count.max()), 2, 12)), np.zeros((len(bodies), int(count.max()), 2))
+    tables = np.zeros((len(bodies), int(count.max()), 2, n)), np.zeros((len(bodies), int(count.max()), 2))
     tables[0][at], tables[1][at] = A[order], nu[order]
     compatible = np.ones(len(nu), bool)
-    compatible[order] = _compatible(*tables, prediction.information[bodies])[at]
+    information = np.tile(np.eye(n), (len(bodies), 1, 1))
+    information[:, :12, :12] = prediction.information[bodies]
+    compatible[order] = _compatible(*tables, information)[at]
     return compatible
 
 
 def _compatible(A: Array, nu: Array, information: Array) -> Mask:
-    """(B, N) of B bodies: whitened derivatives A (B, N, 2, 12), innovations nu (B, N, 2) and prior information.
+    """(B, N) of B bodies: whitened derivatives A (B, N, 2, E), innovations nu (B, N, 2) and prior information.
 
     Rows of zeros, which fill the table, are compatible.
     """
@@ -254,8 +278,8 @@ def _compatible(A: Array, nu: Array, information: Array) -> Mask:
 
 def _deviations(A: Array, nu: Array, information: Array) -> Array:
     """(B, N) squared deviations of each observation from the prediction and all others; 0 for rows of zeros."""
-    J, shape = A.reshape(len(A), -1, 12), nu.shape
-    CJ = J @ _core.inverses(information + J.transpose(0, 2, 1) @ J)
+    J, shape = A.reshape(len(A), -1, A.shape[-1]), nu.shape
+    CJ = J @ np.linalg.inv(information + J.transpose(0, 2, 1) @ J)
     solution = J.transpose(0, 2, 1) @ nu.reshape(len(A), -1, 1)
     u, v = np.moveaxis(nu - (CJ @ solution).reshape(shape), 2, 0)
     (Bu, Bv), (Au, Av) = np.moveaxis(CJ.reshape(A.shape), 2, 0), np.moveaxis(A, 2, 0)

@@ -37,6 +37,7 @@ from fusion.tracking.single_view import SingleViewTracker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
 
+WORTH = 3  # frames that cost as much as their association, which is repeated for each late one
 PAUSED = "no robot is acquired while the wand is recorded"
 
 
@@ -147,8 +148,7 @@ class Tracker:
     ) -> AssociatedFrames:
         """Associate the frames that have arrived, while `n_missing` frames of the set have not.
 
-        An association costs as much as several frames. It is done when three times as many frames are pending as
-        missing: of eight frames, after six.
+        It is done when `WORTH` times as many frames are pending as missing: of eight frames, after six.
 
         Args:
             frame_set: the frames that have arrived.
@@ -157,7 +157,7 @@ class Tracker:
         """
         associated = self.predict(frame_set.t_ns, early)
         pending = associated.association.pending(self.monitors.used(frame_set).frames)
-        return self.associate(associated, frame_set) if len(pending) >= 3 * n_missing > 0 else associated
+        return self.associate(associated, frame_set) if len(pending) >= WORTH * n_missing > 0 else associated
 
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
@@ -191,7 +191,11 @@ class Tracker:
     def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection, ...]:
         """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
         now = Snapshot(frame_set.t_ns, self.table.states, self.table.tracked)
-        return self.monitors.check_extrinsics(frame_set, now, self._recalibrates, self.robust.is_doubtful)
+        is_doubtful = self.robust.is_doubtful
+        corrections = self.monitors.check_extrinsics(frame_set, now, self._recalibrates, is_doubtful)
+        if self.monitors.rig.is_settled and is_doubtful:
+            self.robust.settle()
+        return corrections
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
@@ -252,7 +256,7 @@ class Tracker:
         given = AssignedFrames(prediction.states, tracked, detections, assignments)
         fitted = self.robust.update(prediction, detections, assignments.select(self.own.are_own(given)))
         self.table.states = fitted.states
-        self.rig_response.update(fitted, self.robust.added_px2)
+        self.rig_response.update(fitted)
         self._claim()
         return fitted.assignments
 

@@ -2,6 +2,7 @@
 """A camera that was moved is in the next status, although it is recalibrated within a fraction of a second; one that
 returns has the pose of its calibration."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from fusion.server.server_statistics import PipelineStatus, ServerStatistics
 from tests.benchmarks.faults.arena import small_load
 from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.faults.world import CameraFault
+from tests.benchmarks.fusion_load import Load
 
 TURNS = [
     (0.04, -0.03, 0.02),
@@ -87,3 +89,18 @@ def test_a_camera_that_was_excluded_between_two_statuses_is_reported_once():
     assert not again.cameras["moved"].excluded
     lasting = statistics.report(4 * second, PipelineStatus(excluded=frozenset({"moved"})))
     assert lasting.cameras["moved"].excluded
+
+
+@pytest.mark.slow
+def test_robots_do_not_follow_a_camera_that_is_shifted(tmp_path: Path):
+    """Three cameras with frames at different times: an image that is off by 6 px looks like velocities. Robots stay
+    nearer to the truth than the camera was shifted."""
+    shift_m = (-0.006, -0.010, -0.016)
+    load = Load(robots=4, cameras=3, hz=30.0, speed_m_s=0.5, crossing=True)
+    with VirtualArena(tmp_path, load) as arena:
+        arena.wait(3.0)
+        arena.judge.forget()
+        arena.place("cam2", CameraFault(shift_m=shift_m, since_ns=arena.clock.now_ns()))
+        arena.wait(1.5)
+        assert arena.judge.count > 0
+        assert arena.judge.largest_m < math.dist(shift_m, (0.0, 0.0, 0.0))
