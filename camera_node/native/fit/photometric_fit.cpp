@@ -592,11 +592,20 @@ void PhotometricFitter::allow_shading(const LightGradient& light) {
     ey += prior * light.y;
     const double det = S.det();
     const double sx = (S.yy * ex - S.xy * ey) / det, sy = (S.xx * ey - S.xy * ex) / det;
+    const double left_x = shading_.seen.x - sx, left_y = shading_.seen.y - sy;
+    const bool contradicts =
+        square(left_x) + square(left_y) > kUnlikelyField * (shading_.seen.variance + square(light.sigma));
     const auto Kx = factor_->solve_tail<kPoseCount>(yx), Ky = factor_->solve_tail<kPoseCount>(yy);
-    for (int i = 0; i < kPoseCount; ++i) p_[kX + i] -= Kx[i] * sx + Ky[i] * sy;
+    Vector<kPoseCount>
+        left{};  // the shift by what the prior does not allow of the shading seen, over the noise
+    for (int i = 0; i < kPoseCount; ++i) {
+        p_[kX + i] -= Kx[i] * sx + Ky[i] * sy;
+        if (contradicts) left[i] = (Kx[i] * left_x + Ky[i] * left_y) / noise_;
+    }
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j)
             shading_.effect[i][j] =
+                left[i] * left[j] +
                 (S.yy * Kx[i] * Kx[j] - S.xy * (Kx[i] * Ky[j] + Ky[i] * Kx[j]) + S.xx * Ky[i] * Ky[j]) / det;
 }
 

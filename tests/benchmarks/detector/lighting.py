@@ -27,13 +27,15 @@ def even(light: Array, cards: list[Card], rng: np.random.Generator) -> Array:
     return light
 
 
-def soft_shadow(light: Array, cards: list[Card], rng: np.random.Generator) -> Array:
+def soft_shadow(
+    light: Array, cards: list[Card], rng: np.random.Generator, penumbra: float = PENUMBRA
+) -> Array:
     """The straight edge of a soft shadow across each card."""
     out = light.copy()
     for card, x, y in _surroundings(light, cards):
         turn, at = rng.uniform(0, 2 * np.pi), rng.uniform(-0.5, 0.5)
         across = (np.cos(turn) * x + np.sin(turn) * y) / card.diameter - at
-        out[_box(light, card)] *= 1 - SHADOW * np.clip(0.5 + across / (2 * PENUMBRA), 0, 1)
+        out[_box(light, card)] *= 1 - SHADOW * np.clip(0.5 + across / (2 * penumbra), 0, 1)
     return out
 
 
