@@ -32,6 +32,12 @@ from web.state.feed import ArenaState, DemoProgress, Feed, progress_key
 from web.tabs.camera_tab import decode_jpeg
 from web.view import PERIOD_S, View, check_port
 
+HEIGHT_IN_PANEL = """() => {
+    let y = document.activeElement.getBoundingClientRect().bottom;
+    for (let box = document.activeElement.parentElement; box; box = box.parentElement) y += box.scrollTop;
+    return Math.round(y);
+}"""
+
 
 @pytest.fixture
 def page(view: View) -> Iterator[Page]:
@@ -86,6 +92,16 @@ def require_one_column(view: View, page: Page) -> None:
     assert client.camera.aspect < 1
 
 
+def focused_heights(page: Page, n: int) -> list[int]:
+    """The heights in the panel of the `n` controls on which the key Tab stops after the first tab."""
+    page.get_by_role("tab", name="Cameras").focus()
+    heights = []
+    for _ in range(n):
+        page.keyboard.press("Tab")
+        heights.append(page.evaluate(HEIGHT_IN_PANEL))
+    return heights
+
+
 def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
     """The panel shows all names, the image is not blank, and the buttons show the server's answers."""
     queryable = arena.serve_rig(four_cameras())
@@ -112,6 +128,8 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
     page.wait_for_function("[...document.querySelectorAll('input')].some(input => input.value === 'east')")
     page.get_by_role("button", name="Take a snapshot").click()
     page.get_by_text("east, 64 x 48").wait_for()
+    heights = focused_heights(page, 12)
+    assert heights == sorted(heights), "the focus follows the order of reading"
     page.get_by_role("tab", name="Calibrate").click()
     assert page.get_by_role("button", name="Undo the last change").is_disabled(), "there is no earlier rig"
     page.get_by_role("button", name="Show the whole arena").click()
