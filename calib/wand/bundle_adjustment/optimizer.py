@@ -47,10 +47,7 @@ MAX_ITERATIONS, MAX_ROUNDS = 60, 5
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e6
 # The last step decreases the cost by less than this share, and this absolute amount.
 ROBUST_TOLERANCE, TOLERANCE, ABSOLUTE_TOLERANCE = 5e-3, 1e-4, 1e-4
-# Profiled steps end where those that remain, a geometric series, are this many standard deviations together, over all
-# parameters: the square of all errors grows by a tenth. None increases the cost by more than MAX_GROWTH; a step that
-# does is halved.
-MAX_PROFILED_STEPS, PROFILED_TOLERANCE = 30, 0.3
+# A profiled step that increases the cost by more than MAX_GROWTH is halved.
 MAX_GROWTH, MAX_HALVINGS = 10.0, 5
 # Information that fixes the gauge at the first camera and its clock: about the information of the observations. Readout
 # times and lenses are no part of the gauge.
@@ -229,35 +226,41 @@ def _levenberg_marquardt(objective: _Objective, state: State, robust: bool) -> t
 
 def _profile(objective: _Objective, state: State) -> State | None:
     """The state at which the cameras fit the observations best, with the motion that is optimal for these cameras, by
-    Gauss-Newton; None where it does not converge."""
-    norms, before = objective.norms(state), 1.0
-    for _ in range(MAX_PROFILED_STEPS):
+    Gauss-Newton; None where it does not converge.
+
+    Derivatives along the optimal motion hold only there. From a motion that lags behind its cameras, steps overshoot
+    and alternate, so the motion is optimized before each. Steps end where those that remain, a geometric series of r
+    standard deviations together, add less to the squared error than anyone knows of it: n residuals give a variance to
+    (2 / n)^1/2 of itself.
+    """
+    path = replace(objective, problem=replace(objective.problem, estimated=()))
+    most, before = len(objective.observations) ** -0.25, 1.0  # an observation has two residuals
+    for _ in range(MAX_ITERATIONS):
         try:
+            state, _ = _levenberg_marquardt(path, state, robust=False)
+            norms = objective.norms(state)
             steps = profile_motion(objective.linearize(state, norms)).step(objective.problem, state)
         except np.linalg.LinAlgError:
             return None
         stepped = _step_profiled(objective, state, norms, steps[:2])
-        if stepped is None:
-            return None
-        state, norms = stepped
-        if steps[2] ** 2 < PROFILED_TOLERANCE * (before - steps[2]):
-            return state
-        before = min(steps[2], 1.0)
+        if stepped is None or steps[2] ** 2 < most * (before - steps[2]):
+            return stepped
+        state, before = stepped, min(steps[2], 1.0)
     return None
 
 
 def _step_profiled(
     objective: _Objective, state: State, norms: ErrorNorms, steps: tuple[Array, Array]
-) -> tuple[State, ErrorNorms] | None:
-    """Take the `steps` of cameras and motion, or a part of them; None where the cost grows much with all parts."""
+) -> State | None:
+    """Take the `steps` of cameras and motion from a state with residuals `norms`, or a part of them; None where the cost
+    grows much with all parts."""
     most = MAX_GROWTH * objective.cost(norms) + 1
     for share in 0.5 ** np.arange(MAX_HALVINGS):
         try:
             moved = objective.problem.retract(state, share * steps[0], share * steps[1])
             moved = locate_points(objective.problem, moved, objective.weights.background)
-            after = objective.norms(moved)
-            if objective.cost(after) < most:
-                return moved, after
+            if objective.cost(objective.norms(moved)) < most:
+                return moved
         except ValueError:  # Lens: impossible parameters
             pass
     return None
@@ -330,11 +333,11 @@ def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
     motion = sums.motion.add_diagonal(damping * diagonal + least).factorize()
     right = np.concatenate([sums.crossed, sums.gradient[:, :, None]], axis=2)
     response, motion_step = np.split(motion.solve(right), [size], axis=2)
-    crossed = sums.crossed.reshape(-1, size)
-    information = sums.of_cameras - crossed.T @ response.reshape(-1, size)
+    crossed = sums.crossed.reshape(knots * h, size)
+    information = sums.of_cameras - crossed.T @ response.reshape(knots * h, size)
     information += damping * np.diag(np.diag(sums.of_cameras))
     gradient = sums.scores.sum(axis=0) - crossed.T @ motion_step.ravel()
-    of_cameras = _solve_cameras(system, information, gradient)
+    of_cameras = _solve_cameras(system, information, gradient) if size else gradient
     return _all_parameters(system.problem, of_cameras), motion_step[:, :, 0] - response @ of_cameras
 
 
@@ -367,8 +370,8 @@ def _solve_cameras(system: LinearSystem, information: Array, gradient: Array) ->
 
 def _all_parameters(problem: Problem, of_cameras: Array) -> Array:
     """(C, 18) steps of all parameters of all cameras, from those (S d,) of the estimated ones; 0 for the others."""
-    estimated, step = problem.estimated_cameras(), np.zeros((len(problem.lenses), PER_CAMERA))
-    step[np.ix_(estimated, problem.free)] = of_cameras.reshape(len(estimated), -1)
+    estimated, step = list(problem.estimated_cameras()), np.zeros((len(problem.lenses), PER_CAMERA))
+    step[np.ix_(estimated, problem.free)] = of_cameras.reshape(len(estimated), len(problem.free))
     return step
 
 
@@ -531,7 +534,7 @@ class _Sums:
         gradient[:-1] += motion[:, :h, -1]
         gradient[1:] += motion[:, h:, -1]
         crossed, scores = _sum_cameras(system, local)
-        beside = system.background.scores[:, estimated].reshape(-1, size)
+        beside = system.background.scores[:, estimated].reshape(len(system.background.scores), size)
         return cls(
             motion=BlockTridiagonal.of_chain(motion[:, :, :-1]),
             gradient=gradient,
