@@ -252,8 +252,8 @@ def _profile(objective: _Objective, state: State) -> State | None:
 def _step_profiled(
     objective: _Objective, state: State, norms: ErrorNorms, steps: tuple[Array, Array]
 ) -> State | None:
-    """Take the `steps` of cameras and motion from a state with residuals `norms`, or a part of them; None where the cost
-    grows much with all parts."""
+    """Take the `steps` of cameras and motion from a state with residuals `norms`, or a part of them; None where the
+    cost grows much with all parts."""
     most = MAX_GROWTH * objective.cost(norms) + 1
     for share in 0.5 ** np.arange(MAX_HALVINGS):
         try:
