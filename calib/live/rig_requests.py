@@ -52,15 +52,33 @@ def set_rig(
     return _read(send_request(session, set_rig_key(arena), encode(request), timeout_s))
 
 
-def undo_rig(session: zenoh.Session, arena: str, program: str, timeout_s: float = REQUEST_S) -> RigMessage:
-    """Have the server undo the last change of its rig; returns and raises as `set_rig`."""
-    request = encode(RigStepRequest(source=RequestSource.of(program)))
+def undo_rig(
+    session: zenoh.Session,
+    arena: str,
+    program: str,
+    timeout_s: float = REQUEST_S,
+    rig_t_ns: int | None = None,
+) -> RigMessage:
+    """Have the server undo the last change of its rig; returns and raises as `set_rig`.
+
+    `rig_t_ns` as in `RigStepRequest`.
+    """
+    request = encode(RigStepRequest(source=RequestSource.of(program), rig_t_ns=rig_t_ns))
     return _read(send_request(session, undo_rig_key(arena), request, timeout_s))
 
 
-def redo_rig(session: zenoh.Session, arena: str, program: str, timeout_s: float = REQUEST_S) -> RigMessage:
-    """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`."""
-    request = encode(RigStepRequest(source=RequestSource.of(program)))
+def redo_rig(
+    session: zenoh.Session,
+    arena: str,
+    program: str,
+    timeout_s: float = REQUEST_S,
+    rig_t_ns: int | None = None,
+) -> RigMessage:
+    """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`.
+
+    `rig_t_ns` as in `RigStepRequest`.
+    """
+    request = encode(RigStepRequest(source=RequestSource.of(program), rig_t_ns=rig_t_ns))
     return _read(send_request(session, redo_rig_key(arena), request, timeout_s))
 
 

@@ -199,10 +199,16 @@ class RigRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class RigStepRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Asks the server to undo the last change of the rig, or to redo the change that was undone last."""
+    """Asks the server to undo the last change of the rig, or to redo the change that was undone last.
+
+    Attributes:
+        rig_t_ns: `t_ns` of the `RigMessage` that the sender takes to be in force; the request is refused where another
+            one is, as after the same request of another operator. None for any.
+    """
 
     version: int = VERSION
     source: RequestSource | None = None
+    rig_t_ns: int | None = None
 
 
 class RigVersion(RigChange, frozen=True, kw_only=True, omit_defaults=False):

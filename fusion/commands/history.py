@@ -77,7 +77,8 @@ def _step(session: zenoh.Session, arena: str, step: Callable[..., RigMessage], w
     """Change the server's rig; returns a sentence about the result."""
     before, history = request_rig(session, arena), request_rig_history(session, arena)
     version = history.next_undo() if step is undo_rig else history.next_redo()
-    after = step(session, arena, f"roundel {step.__name__.removesuffix('_rig')}").rig
+    program = f"roundel {step.__name__.removesuffix('_rig')}"
+    after = step(session, arena, program, rig_t_ns=history.rig_t_ns).rig
     old = before.cameras if before else {}
     changed = [name for name in {**old, **after.cameras} if old.get(name) != after.cameras.get(name)]
     what = printable(version.describe()) if version else "the last change"

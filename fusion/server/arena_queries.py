@@ -110,14 +110,25 @@ class ArenaQueries:
         return self._announce_rig(query, "changed", request.source)
 
     def _undo_rig(self, query: zenoh.Query) -> bytes:
-        request = _parse_step(query)
+        request = self._parse_step(query)
         self._pipeline.undo_rig(self._clock.now_ns(), request.source)
         return self._announce_rig(query, "set back to the previous one", request.source)
 
     def _redo_rig(self, query: zenoh.Query) -> bytes:
-        request = _parse_step(query)
+        request = self._parse_step(query)
         self._pipeline.redo_rig(self._clock.now_ns(), request.source)
         return self._announce_rig(query, "set to the one that was undone", request.source)
+
+    def _parse_step(self, query: zenoh.Query) -> RigStepRequest:
+        payload = payload_of(query)
+        request = parse_request(payload, RigStepRequest) if payload else RigStepRequest()
+        history = self._pipeline.active_rig.history()
+        if request.rig_t_ns in (None, history.rig_t_ns):
+            return request
+        newest = next((version.describe() for version in history.versions if version.state == "in force"), "")
+        raise RequestError(
+            f"nothing was done, because the rig has changed since it was shown: {newest}; look, and repeat"
+        )
 
     def _prepare_step(self, payload: bytes) -> None:
         for rig in self._pipeline.active_rig.neighbours():
@@ -257,8 +268,3 @@ class CameraQueries:
 def _prepare_lenses(payload: bytes) -> None:
     with contextlib.suppress(RequestError):  # which the answer to the request reports
         prepare_lenses(parse_request(payload, RigRequest).rig.placed().values())
-
-
-def _parse_step(query: zenoh.Query) -> RigStepRequest:
-    payload = payload_of(query)
-    return parse_request(payload, RigStepRequest) if payload else RigStepRequest()

@@ -113,13 +113,13 @@ class Subscription:
             NetworkError: it does not answer.
         """
         history = self.feed.state().history
-        undo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
+        undo_rig(self.session, self.feed.keys.arena, "web", timeout_s, history.rig_t_ns if history else None)
         return _describe_step("undone", history.next_undo() if history else None)
 
     def redo(self, timeout_s: float = REQUEST_S) -> str:
         """Have the server redo the change of its rig that was undone last; returns and raises as `undo`."""
         history = self.feed.state().history
-        redo_rig(self.session, self.feed.keys.arena, "web", timeout_s)
+        redo_rig(self.session, self.feed.keys.arena, "web", timeout_s, history.rig_t_ns if history else None)
         return _describe_step("redone", history.next_redo() if history else None)
 
     def _declare(self, session: zenoh.Session) -> None:

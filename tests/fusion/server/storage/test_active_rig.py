@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from calib.live.rig_requests import set_rig
+from calib.live.rig_requests import set_rig, undo_rig
 from calib.rig.file_history import MAX_OLD, History
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from calib.rig.rig_messages import RigHistory, SavedChange
@@ -367,6 +367,18 @@ def test_the_server_of_another_zone_follows_the_rig_and_the_robots_of_the_first(
             wait_for(
                 lambda: list(follower.pipeline.robots) == ["b"]
             )  # the first server's status tells of them
+
+
+def test_an_undo_that_arrives_twice_undoes_one_change(tmp_path: Path):
+    """As of two operators, or of a request that a broken connection repeats."""
+    with serving(saving(tmp_path)) as (_, client):
+        client.set_rig(numbered(1))
+        seen = client.set_rig(numbered(2)).t_ns
+        assert undo_rig(client.session, "test", "test", rig_t_ns=seen).rig == numbered(1)
+        with pytest.raises(RequestError, match="nothing was done, because the rig has changed"):
+            undo_rig(client.session, "test", "test", rig_t_ns=seen)
+        assert client.rig_history().next_redo() is not None
+        assert client.undo_rig().rig == GIVEN
 
 
 def test_a_viewer_that_missed_a_publication_requests_the_rig(tmp_path: Path):
