@@ -166,7 +166,7 @@ def test_a_camera_is_renamed_and_forgotten(arena: LiveArena, view: View):
         page.locator("xpath=//*[text()='Rename to']/following::input[1]").fill("north-2")
         wait_for(lambda: value_of(view, "Rename to") == "north-2")
         rename.click()
-        page.get_by_text("camera-1 is called north-2 from now on").wait_for()
+        page.get_by_text("camera-1 is called north-2 from now on", exact=True).wait_for()
         page.get_by_role("button", name="Forget the camera").click()
         page.get_by_text("click again to forget camera-1").wait_for()
         page.get_by_role("button", name="Forget: click again").click()

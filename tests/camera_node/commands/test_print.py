@@ -37,13 +37,19 @@ def to_mm(uv: np.ndarray) -> np.ndarray:
     return (np.asarray(uv) + 0.5) / PX_PER_MM
 
 
+def exposed(raster: np.ndarray) -> np.ndarray:
+    """The raster as a well exposed picture: paper at the scale's end may be brighter, which hides a part of its edges
+    (axes of 189 px are 0.07 px off there in place of 0.04)."""
+    return np.rint(0.8 * raster + 20).astype(np.uint8)
+
+
 def scan(raster: np.ndarray, diameter_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres (N, 2) and axes (N, 2) of the roundels, mm, and their ratios, from the raster at 200 px a diameter."""
     width = round(raster.shape[1] * min(1.0, 200 / (diameter_mm * PX_PER_MM)))
     scale = width / raster.shape[1]
     height = round(raster.shape[0] * scale)
     smaller = cv2.resize(raster, (width, height), interpolation=cv2.INTER_AREA)
-    found = Detector().detect(np.asarray(smaller, np.uint8))
+    found = Detector().detect(exposed(smaller))
     factor = np.array([raster.shape[1] / width, raster.shape[0] / height]) / PX_PER_MM
     return (found.uv + 0.5) * factor, found.axes_px * factor.mean(), found.ratio
 
@@ -208,7 +214,7 @@ def test_pdf_and_svg_are_the_same(tmp_path: Path):
     flags = "--headless --no-sandbox --disable-gpu --disable-background-networking --window-size=794,1123"
     places = [f"--screenshot={picture}", f"--user-data-dir={tmp_path / 'profile'}", sheet.as_uri()]
     subprocess.run([chromium, *flags.split(), *places], check=True, timeout=60, capture_output=True)
-    svg = Detector().detect(read_grey(picture))
+    svg = Detector().detect(exposed(read_grey(picture)))
     (raster,) = rasterize(write(tmp_path, what="roundels", diameter=0.05))
     centres, axes, _ = scan(raster, 50)
     assert len(svg) == len(centres) == 12

@@ -11,12 +11,12 @@ import zenoh
 
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import decode, encode
+from camera_node.protocol.requests import send_request
 from camera_node.protocol.session import open_client, open_router
 from fusion.client.robot_definition import LOST_AT_RESTART
 from fusion.errors import FusionError
 from fusion.model.robots import load_robots
 from fusion.protocol.pose_messages import Robots, RobotsRequest, robots_key, set_robots_key
-from fusion.protocol.robot_requests import change_robots
 from fusion.tracking.tracker import PAUSED
 from tests.fusion.serving import ARENA, KEYS, config, later, live, send, send_until_tracked, serving
 from tests.fusion.synthetic import WIDE
@@ -59,7 +59,7 @@ def test_a_server_that_hangs_does_not_refuse(endpoint):
     with open_router([endpoint]) as router, open_client([endpoint]) as client:
         queryable = router.declare_queryable(set_robots_key("test"), held.append)
         with pytest.raises(NetworkError, match="no server answers on test/robots/set within 1 s"):
-            change_robots(client, "test", RobotsRequest(), timeout_s=1.0)
+            send_request(client, set_robots_key("test"), encode(RobotsRequest()), timeout_s=1.0, answer_s=1.0)
         assert held
         held.clear()  # before the session closes
         queryable.undeclare()

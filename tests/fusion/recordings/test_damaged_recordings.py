@@ -149,7 +149,7 @@ def test_a_rig_in_a_damaged_part_is_missed_with_the_damage(tmp_path: Path):
     """Before: the error advised another rig, and said nothing of the damage."""
     done = run_program("fusion", "replay", damaged_sample(tmp_path, at=0), "--out", tmp_path / "poses.csv")
     assert done.returncode == 2
-    assert "holds no rig (skipped: " in done.stderr
+    assert "holds no rig and no robots (skipped: " in done.stderr
     assert "1 damaged part" in done.stderr
 
 
