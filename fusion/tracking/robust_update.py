@@ -243,9 +243,10 @@ def jointly_compatible(
     variance = observations.detections.variance_px2
     share = np.sqrt(variance / (variance + slack_px2))[:, None]
     A, nu = A.reshape(-1, 2, 12) * share[:, :, None], nu.reshape(-1, 2) * share
-    cameras, seen_by = np.unique(observations.detections.camera, return_inverse=True)
-    turns = np.eye(2 * len(cameras)).reshape(-1, 2, 2 * len(cameras))[seen_by]
-    A = np.concatenate([A, turns * np.sqrt(common_px2 / (variance + slack_px2))[:, None, None]], 2)
+    if common_px2:
+        cameras, seen_by = np.unique(observations.detections.camera, return_inverse=True)
+        turns = np.eye(2 * len(cameras)).reshape(-1, 2, 2 * len(cameras))[seen_by]
+        A = np.concatenate([A, turns * np.sqrt(common_px2 / (variance + slack_px2))[:, None, None]], 2)
     n = A.shape[2]
     order = np.argsort(observations.discs.body, kind="stable")
     bodies, first, count = np.unique(observations.discs.body[order], return_index=True, return_counts=True)
