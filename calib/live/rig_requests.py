@@ -63,8 +63,7 @@ def undo_rig(
 
     `rig_t_ns` as in `RigStepRequest`.
     """
-    request = encode(RigStepRequest(source=RequestSource.of(program), rig_t_ns=rig_t_ns))
-    return _read(send_request(session, undo_rig_key(arena), request, timeout_s))
+    return _request_step(session, undo_rig_key(arena), program, timeout_s, rig_t_ns)
 
 
 def redo_rig(
@@ -78,8 +77,14 @@ def redo_rig(
 
     `rig_t_ns` as in `RigStepRequest`.
     """
-    request = encode(RigStepRequest(source=RequestSource.of(program), rig_t_ns=rig_t_ns))
-    return _read(send_request(session, redo_rig_key(arena), request, timeout_s))
+    return _request_step(session, redo_rig_key(arena), program, timeout_s, rig_t_ns)
+
+
+def _request_step(
+    session: zenoh.Session, key: str, program: str, timeout_s: float, rig_t_ns: int | None
+) -> RigMessage:
+    request = RigStepRequest(source=RequestSource.of(program), rig_t_ns=rig_t_ns)
+    return _read(send_request(session, key, encode(request), timeout_s))
 
 
 def request_rig_history(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> RigHistory:

@@ -143,11 +143,10 @@ def gather(
     uv, cov, axes_px, angle_rad, number = tables
     probability = [message.id_probability or UNREAD * len(message) for message in messages]
     is_code = np.isfinite(_read_column(probability, "<f4", 1)[:, 0])
-    marker = {code: k for k, code in enumerate(codes) if code != PLAIN}
-    label = [
-        marker.get(int(k), FOREIGN) if is_read else int(k)
-        for k, is_read in zip(number[:, 0], is_code, strict=True)
-    ]
+    label = np.where(is_code, FOREIGN, number[:, 0]).astype(np.intp)
+    for k, code in enumerate(codes):
+        if code != PLAIN:
+            label[is_code & (number[:, 0] == code)] = k
     frame = np.repeat(np.arange(len(messages)), [len(data) // 16 for data in columns[0]])
     image_row = image_rows(lenses, camera[frame], uv)
     detections = WandDetections(
@@ -156,7 +155,7 @@ def gather(
         frames.t_s[frame] + readout_s[frame] * image_row,
         image_row,
         stamp_sigmas(camera, 1e-6 * np.array(bound_us))[frame],
-        np.array(label, np.intp),
+        label,
         uv,
         cov[:, [0, 1, 1, 2]].reshape(-1, 2, 2),
         axes_px,

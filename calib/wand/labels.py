@@ -134,9 +134,8 @@ def _assign_labels(
     if (detections.label >= 0).any():
         reason[counts > 0] = "no marker of the wand in the frame"
         labels = _label_by_number(detections, markers)
-        if (
-            any(wand.codes) and not timing.synchronous
-        ):  # a code that is blurred in one frame is read in the next
+        # A code that is blurred in one frame is read in the next.
+        if any(wand.codes) and not timing.synchronous:
             labels = propagate_labels(frames, detections, labels, markers)
         return labels, reason
     if markers == 1:

@@ -93,7 +93,7 @@ def collect_markers(session: zenoh.Session, arena: str, seconds: float) -> list[
     """Messages of a running server that contain unlabeled markers, from the first one until one `seconds` later.
 
     A busy machine fuses fewer frames, and of some only those of one camera, which locate no marker: such messages say
-    nothing about markers that keep still, and are left out.
+    nothing about markers that stand still, and are left out.
 
     Returns:
         The messages; none if for `REQUEST_S` none contained an unlabeled marker.

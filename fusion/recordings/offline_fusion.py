@@ -281,7 +281,8 @@ def cameras_of(recording: ArenaRecording, path: Path, rig: Path | None) -> dict[
     if rig is not None:
         return load_rig(rig).require_placed(rig)
     require_held(recording, path, rig=recording.rig)
-    return recording.rig.placed() if recording.rig is not None else {}
+    assert recording.rig is not None
+    return recording.rig.placed()
 
 
 def require_held(recording: ArenaRecording, path: Path, **held: object) -> None:

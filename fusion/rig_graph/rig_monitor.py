@@ -221,9 +221,8 @@ class RigMonitor:
         self._note_clocks(verdict, measured)
         is_open = verdict.is_of_rig or (bool(names) and verdict.cause is None)
         self._n_undecided = self._n_undecided + 1 if is_open else 0
-        if (
-            self._n_undecided == 1 and not self._was_doubtful
-        ):  # keyframes from before make anything look right
+        # Keyframes from before the change may make any hypothesis look right.
+        if self._n_undecided == 1 and not self._was_doubtful:
             self._keyframes.clear()
         self._is_contradicted = bool(names) or self._n_undecided == 1
         if verdict.cause is None:

@@ -122,10 +122,11 @@ class ArenaQueries:
     def _parse_step(self, query: zenoh.Query) -> RigStepRequest:
         payload = payload_of(query)
         request = parse_request(payload, RigStepRequest) if payload else RigStepRequest()
-        history = self._pipeline.active_rig.history()
-        if request.rig_t_ns in (None, history.rig_t_ns):
+        active = self._pipeline.active_rig
+        if request.rig_t_ns in (None, active.message and active.message.t_ns):
             return request
-        newest = next((version.describe() for version in history.versions if version.state == "in force"), "")
+        versions = active.history().versions
+        newest = next((version.describe() for version in versions if version.state == "in force"), "")
         raise RequestError(
             f"nothing was done, because the rig has changed since it was shown: {newest}; look, and repeat"
         )
