@@ -39,7 +39,7 @@ PARTS = {
     "lighting": lighting.measure,
     "bent": bent.measure,
     "second": measurement.measure,
-    "models": models.measure,
+    "attack": models.measure,
 }
 
 
@@ -61,7 +61,7 @@ class Benchmark:
                 "lighting",
                 "bent",
                 "second",
-                "models",
+                "attack",
                 "all",
             ],
             ...,
@@ -73,6 +73,10 @@ class Benchmark:
     """The detectors to measure: values of `Detector(detector=...)`."""
     thorough: bool = False
     """Measure the whole grid with many more draws; takes hours instead of two minutes."""
+    seed: int = 0
+    """Other pictures for `attack`."""
+    quick: bool = False
+    """Fewer pictures in `attack`: about two minutes of one core."""
 
     def run(self) -> None:
         """Print the tables and goals of each detector."""
@@ -85,7 +89,7 @@ class Benchmark:
             except ConfigError as error:
                 console.print(f"{name}: not measured, {error}")
                 continue
-            run = Run(name, make, self.thorough)
+            run = Run(name, make, self.thorough, self.seed, self.quick)
             print_verdicts(console, name, [v for measure in parts.values() for v in measure(run, console)])
 
 

@@ -29,7 +29,7 @@ class Errors:
 
 def measure_bend(run: Run, bend: float, diameter: float, count: int) -> Errors:
     """Measure so many views; the true outline is that of a flat disc in the same place."""
-    rng = np.random.default_rng(int(1000 * bend + diameter))
+    rng = np.random.default_rng((int(1000 * bend + diameter), run.seed))
     rows = []
     for _ in range(count):
         sight = _sight(bend, diameter, rng)

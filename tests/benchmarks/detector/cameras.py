@@ -116,11 +116,11 @@ MISSING: dict[str, Callable[[int], Iterator[Grey]]] = {
 }
 
 
-def share_found(known: Detector, sensor: Camera, light: Light, frames: int) -> float:
+def share_found(known: Detector, sensor: Camera, light: Light, frames: int, seed: int = 0) -> float:
     """The share of the cards of so many pictures that is found in the first frame of each."""
     there = lost = 0
-    for seed in range(frames):
-        rng = np.random.default_rng(seed)
+    for frame in range(frames):
+        rng = np.random.default_rng((frame, seed))
         picture, shown = light(rng)
         found = known.adjusted().detect(sensor.expose(picture, rng))
         there, lost = there + len(shown), lost + missed(shown, found.uv)
@@ -131,7 +131,7 @@ def share_of_print(run: Run, sensor: Camera, ratio: float, frames: int, frame: i
     """The share of the cards of an unknown print that a new detector finds in this frame of each picture."""
     there = lost = 0
     for seed in range(frames):
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng((seed, run.seed))
         shown = [replace(card, ratio=ratio) for card in cards(rng)]
         light, detector = paste(ground("clutter", rng), shown), run.make()
         for _ in range(frame - 1):
@@ -166,9 +166,10 @@ def errors(
     frames: int,
     disturb: Disturb | None = None,
     on: str = "even",
+    seed: int = 0,
 ) -> Errors:
     """Measure cards of random sizes in a band, tilted by up to 60 degrees, on a ground, in disturbed light."""
-    rng = np.random.default_rng(band)
+    rng = np.random.default_rng((*band, seed))
     rows, there = [], 0
     for _ in range(frames):
         shown = [

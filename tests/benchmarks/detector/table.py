@@ -16,21 +16,24 @@ MakeDetector = Callable[[], Detector]
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict on one goal; `met` is None if nothing was measured."""
+    """The verdict on one goal; `met` is None if nothing was measured, `before` what it was when the goal was set."""
 
     what: str
     measured: str
     goal: str
     met: bool | None
+    before: str = ""
 
 
 @dataclass(frozen=True)
 class Run:
-    """The options of a run: the detector's name and constructor, and whether to measure the whole grid."""
+    """The options of a run: the detector's name and constructor, how much to measure, and a seed for other pictures."""
 
     name: str
     make: MakeDetector
     thorough: bool
+    seed: int = 0
+    quick: bool = False
 
 
 def table(title: str, headings: Iterable[str], rows: Iterable[Iterable[object]]) -> Table:
@@ -46,8 +49,8 @@ def table(title: str, headings: Iterable[str], rows: Iterable[Iterable[object]])
 def print_verdicts(console: Console, name: str, verdicts: Iterable[Verdict]) -> None:
     """Print the verdicts on the goals of one detector."""
     marks = {True: "[green]met[/]", False: "[red]missed[/]", None: "-"}
-    rows = [(v.what, v.measured, v.goal, marks[v.met]) for v in verdicts]
-    console.print(table(f"{name}: goals", ("what", "measured", "goal", ""), rows))
+    rows = [(v.what, v.before, v.measured, v.goal, marks[v.met]) for v in verdicts]
+    console.print(table(f"{name}: goals", ("what", "before", "measured", "goal", ""), rows))
 
 
 def milliseconds(work: Callable[[], object], seconds: float) -> float:

@@ -22,10 +22,10 @@ from camera_node.simulation.sensor import CLEAN, HARSH, MILD, Sensor
 from tests.benchmarks.detector.cameras import FORGET, SIZES, acquainted
 from tests.benchmarks.detector.lighting import NOISE, Disturb, even, gloss, soft_shadow
 from tests.benchmarks.detector.pictures import Card, flat, grid, paste, sight_of
-from tests.benchmarks.detector.recall import ground
+from tests.benchmarks.detector.recall import ground, occlude
 from tests.benchmarks.detector.second import scene, surroundings
 from tests.benchmarks.detector.second.camera import Camera
-from tests.benchmarks.detector.second.print_geometry import FOCAL, SIZE, Print
+from tests.benchmarks.detector.second.print_geometry import FOCAL, INNER, SIZE, Print
 from tests.benchmarks.detector.table import Run, Verdict, table
 from tests.camera_node.tracing import Sight, ellipse_of, trace
 
@@ -55,7 +55,7 @@ Generator = Callable[[tuple[int, int], np.random.Generator], Picture]
 
 @dataclass(frozen=True)
 class Second:
-    """A condition of the second generator."""
+    """A condition of the second generator; a bar covers the share `cover` of each disc, `gain` multiplies the light."""
 
     camera: Camera = MONOCHROME
     light: scene.Light = "room"
@@ -63,10 +63,16 @@ class Second:
     square: bool = False
     curl: float = 0.0
     coma: float = 0.0
+    ratio: float = INNER
+    gain: float = 1.0
+    cover: float = 0.0
 
     def show(self, band: tuple[int, int], rng: np.random.Generator) -> Picture:
         """A picture of twenty prints of a band of sizes."""
-        prints = scene.draw_prints(band, rng, square=self.square, curl=self.curl)
+        prints = [
+            replace(card, ratio=self.ratio)
+            for card in scene.draw_prints(band, rng, square=self.square, curl=self.curl)
+        ]
         return self._expose(prints, rng), [_truth(card) for card in prints]
 
     def show_ground(self, rng: np.random.Generator) -> Grey:
@@ -75,7 +81,10 @@ class Second:
 
     def _expose(self, prints: list[Print], rng: np.random.Generator) -> Grey:
         there = scene.Scene.draw(self.grounds[rng.integers(len(self.grounds))], self.coma, rng)
-        return self.camera.expose(scene.render(there, prints, self.light, rng), rng)
+        light = self.gain * scene.render(there, prints, self.light, rng)
+        for card in prints if self.cover else []:
+            occlude(light, Card(card.uv, card.diameter), self.cover, rng.uniform(-1, 1), rng)
+        return self.camera.expose(light, rng)
 
     def acquaint(self, run: Run) -> Detector:
         """A detector that has seen three pictures of this camera, and tracks nothing."""
@@ -152,9 +161,11 @@ class Errors:
     normal: float
 
 
-def measure_cell(known: Detector, show: Generator, band: tuple[int, int], frames: int) -> Errors:
+def measure_cell(
+    known: Detector, show: Generator, band: tuple[int, int], frames: int, seed: int = 0
+) -> Errors:
     """Measure so many pictures of one condition and band."""
-    rng = np.random.default_rng(band)
+    rng = np.random.default_rng((*band, seed))
     rows, there = [], 0
     for _ in range(frames):
         picture, truths = show(band, rng)

@@ -2,7 +2,7 @@
 """Where a print is seen: its homography, the conic of its outline, curled paper, and exact coverage of a raster.
 
 Lengths in the print's plane are in outer radii. The ring has the print's definition and nothing else: outer radius 1,
-inner radius `inner_ratio`, card `surround_ratio` (`camera_node/geometry/body.py`).
+inner radius `inner_ratio` (0.6 unless another is given), card `surround_ratio` (`camera_node/geometry/body.py`).
 """
 
 from dataclasses import dataclass
@@ -30,6 +30,7 @@ class Print:
         square: whether the card is cut as a square, its side being the diameter of the round card.
         curl: height of the cone above the tangent plane at a card's radius from its axis, over the card's diameter;
             `axis` the direction of the cone's axis in the plane, radians.
+        ratio: of the hole's and the disc's diameter.
     """
 
     uv: tuple[float, float]
@@ -39,6 +40,7 @@ class Print:
     square: bool = False
     curl: float = 0.0
     axis: float = 0.0
+    ratio: float = INNER
 
     @property
     def centre(self) -> Array:
@@ -92,7 +94,7 @@ class Print:
         angle = np.linspace(0, 2 * np.pi, POINTS, endpoint=False)
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         card = circle / np.abs(circle).max(axis=1, keepdims=True) if self.square else circle
-        return self.image_of(CARD * card), self.image_of(circle), self.image_of(INNER * circle)
+        return self.image_of(CARD * card), self.image_of(circle), self.image_of(self.ratio * circle)
 
     @property
     def _height(self) -> float:
