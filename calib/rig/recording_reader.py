@@ -51,11 +51,11 @@ class ReadLimits:
 
     Attributes:
         chunk_bytes: of a chunk, compressed or not. The recorder ends a chunk at 1 MB and one message.
-        message_bytes: of a message; the network carries no larger one.
+        message_bytes: of a message; other programs record larger ones than the network carries.
     """
 
-    chunk_bytes: int = 2 * MAX_BYTES
-    message_bytes: int = MAX_BYTES
+    chunk_bytes: int = 8 * MAX_BYTES
+    message_bytes: int = 4 * MAX_BYTES
 
 
 class Message(NamedTuple):

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Publishes small pictures of a camera, with the detected roundels, while anyone subscribes to them."""
 
+import contextlib
 import logging
 import threading
 import time
 from collections.abc import Callable
 
-import cv2
 import zenoh
 
 from camera_node.detection.overlay import draw_preview
 from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.protocol.messages import MAX_PREVIEW_BYTES, Preview, encode
+from camera_node.protocol.requests import RequestError, encode_jpeg
 
 log = logging.getLogger("camera_node.preview")
 
 PERIOD_S = 0.3  # between two pictures
 SIDE_PX = 320  # of a picture, at most
-QUALITIES = (60, 30, 10)  # of the JPEG: the first that fits into `MAX_PREVIEW_BYTES`
+QUALITY = 60  # of the JPEG
 MAX_SHARE = 0.02  # of a core: a slow machine sends fewer pictures
 CLOSE_S = 5.0
 Content = tuple[Grey, Roundels, tuple]  # image, its roundels, the mask's polygons
@@ -97,9 +98,6 @@ class PreviewPublisher:
 
 def encode_preview(image: Grey, roundels: Roundels, mask: tuple[Array, ...] = ()) -> bytes:
     """A small picture of an image with its roundels and the mask drawn, as JPEG; empty if it does not fit."""
-    picture = draw_preview(image, roundels, mask, SIDE_PX)
-    for quality in QUALITIES:
-        data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-        if len(data) <= MAX_PREVIEW_BYTES:
-            return data
+    with contextlib.suppress(RequestError):
+        return encode_jpeg(draw_preview(image, roundels, mask, SIDE_PX), QUALITY, MAX_PREVIEW_BYTES)
     return b""

@@ -14,7 +14,9 @@ from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import is_name, require_name
 
 VERSION = 1
-MAX_BYTES = 1 << 24  # of a message, unless its class has a MAX_BYTES of its own
+# Of a message, unless its class has a MAX_BYTES of its own. The largest are pictures; a frame with the most roundels
+# has 0.3 MB.
+MAX_BYTES = 1 << 22
 MAX_ROUNDELS = 4096  # in one frame; messages with more are refused
 MAX_POSITIONS = 256  # in one message of relative positions; messages with more are refused
 MAX_DISTANCE_M = 1e4

@@ -16,7 +16,7 @@ import zenoh
 
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import NetworkError, RoundelError
-from camera_node.protocol.messages import decode, encode
+from camera_node.protocol.messages import MAX_BYTES, decode, encode
 from camera_node.protocol.presence import SILENT, why_no_server
 from camera_node.protocol.session import ask_server
 
@@ -158,12 +158,18 @@ def respond(query: zenoh.Query, answer: Callable[[zenoh.Query], bytes]) -> bool:
     return True
 
 
-def encode_jpeg(image: Grey, quality: int) -> bytes:
-    """Encode an image, grey or BGR, as JPEG with a quality of 1 to 100."""
+def encode_jpeg(image: Grey, quality: int, max_bytes: int = MAX_BYTES) -> bytes:
+    """Encode an image, grey or BGR, as JPEG with a quality of 1 to 100, which is halved until the picture fits.
+
+    Raises:
+        RequestError: the image has no pixels or too many.
+    """
     ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not ok:
-        raise RequestError("the image could not be encoded as JPEG; try another quality")
-    return data.tobytes()
+    if ok and len(data) <= max_bytes:
+        return data.tobytes()
+    if quality == 1:
+        raise RequestError(f"the picture has no JPEG of at most {max_bytes} bytes; use a lower resolution")
+    return encode_jpeg(image, quality // 2, max_bytes)
 
 
 def parse_flag(parameters: zenoh.Parameters, name: str) -> bool:

@@ -33,8 +33,9 @@ ASSIGNED_PORT = re.compile(r":0(?=[?#]|$)")  # of an endpoint whose port the ope
 RETRY = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
 OPEN_TIMEOUT_MS = 1000  # of one attempt; `close` waits this long for a listener that is not Zenoh
 LEASE_MS = 1500  # of a silent connection, which is then re-established; TCP would retry ever more rarely
-# Bytes; the largest are snapshots. Zenoh's own limit is 1 GB, which each receiver assembles.
-MAX_MESSAGE = 1 << 24
+# Bytes: `messages.MAX_BYTES`, the key and the header. A receiver holds the parts of a message that is never completed,
+# for each priority of each session; Zenoh's own limit is 1 GB.
+MAX_MESSAGE = (1 << 22) + (1 << 16)
 ALWAYS = {
     "transport/link/tx/lease": LEASE_MS,
     # A request that waits for a full link holds a lock that the end of the lease needs; Zenoh's own limit is 5 s.

@@ -38,7 +38,7 @@ FORMATS: dict[str, Format] = {  # of `roundel export`, by suffix
 MAX_FRAMES = 65535  # of a C3D file, whose counter has 16 bits
 MM = 1000.0
 TRAIL_M = 0.004  # radius of a drawn trail
-ROW_GROUP = 1 << 14  # of a Parquet file: 10 MB in memory
+ROW_GROUP = 1 << 12  # rows of a Parquet file, each of 2 kB in memory and again as columns
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"
 
 

@@ -24,7 +24,7 @@ from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
-from camera_node.protocol.messages import Detections, Keys, MessageError, decode, encode
+from camera_node.protocol.messages import MAX_BYTES, Detections, Keys, MessageError, decode, encode
 from camera_node.protocol.server_connection import ServerConnection
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
@@ -35,7 +35,6 @@ from fusion.recordings.rotation import RotatingWriter
 log = logging.getLogger("fusion.recording")
 Entry = tuple[str, bytes, int]  # key, data, time of arrival in ns
 QUEUE_SIZE = 20_000
-MAX_MESSAGE_BYTES = 1 << 22  # a frame with 4096 roundels has 0.3 MB
 MAX_QUEUED_BYTES = 1 << 28
 MAX_KEYS, MAX_KEY = 1024, 200  # the channels of a recording; characters of a key
 WAIT_S = 0.1
@@ -243,8 +242,8 @@ class ArenaRecorder:
             if len(key) > MAX_KEY:
                 self.lost[f"messages on keys of more than {MAX_KEY} characters"] += 1
                 return
-            if size > MAX_MESSAGE_BYTES:
-                self.lost[f"messages of more than {MAX_MESSAGE_BYTES} bytes"] += 1
+            if size > MAX_BYTES:
+                self.lost[f"messages of more than {MAX_BYTES} bytes"] += 1
                 return
             if self._queued_bytes + size > MAX_QUEUED_BYTES or self._received.full():
                 self.lost["messages that the disk was too slow for"] += 1

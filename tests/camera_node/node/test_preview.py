@@ -22,6 +22,7 @@ from camera_node.node.node import Node
 from camera_node.node.preview import MAX_SHARE, PreviewPublisher, encode_preview
 from camera_node.protocol.camera_requests import mask_of, next_detections, request_settings
 from camera_node.protocol.messages import (
+    MAX_BYTES,
     MAX_PREVIEW_BYTES,
     Keys,
     MessageError,
@@ -30,6 +31,7 @@ from camera_node.protocol.messages import (
     encode,
     jpeg_size,
 )
+from camera_node.protocol.requests import encode_jpeg
 from camera_node.protocol.server_connection import Connection
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.node.picture import CENTRE, render
@@ -135,6 +137,14 @@ def test_a_picture_that_declares_a_huge_image_is_refused():
 def test_a_noisy_image_still_fits():
     image = np.random.default_rng(0).integers(0, 255, (2000, 320), np.uint8)
     assert 0 < len(encode_preview(image, Detector().detect(np.zeros((9, 9), np.uint8)))) <= MAX_PREVIEW_BYTES
+
+
+def test_a_noisy_snapshot_is_sent_in_a_lower_quality():
+    """The network carries no larger message; a small picture keeps the quality that was asked for."""
+    image = np.random.default_rng(0).integers(0, 255, (2400, 2400), np.uint8)
+    assert MAX_BYTES / 4 < len(encode_jpeg(image, 100)) <= MAX_BYTES
+    wanted = cv2.imencode(".jpg", image[:500], [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    assert encode_jpeg(image[:500], 100) == wanted
 
 
 def test_masking_what_is_detected_silences_it(network, node: Node, tmp_path: Path, capsys):

@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from camera_node.foundation.errors import ConfigError, NetworkError
+from camera_node.protocol.messages import MAX_BYTES
 from camera_node.protocol.requests import send_request
 from camera_node.protocol.session import (
     BURST_BUFFER,
@@ -183,8 +184,8 @@ def test_a_giant_message_reaches_nobody_and_harms_no_other(network, inbox, event
     sender.put("a/giant", bytes(MAX_MESSAGE + 1), congestion_control=zenoh.CongestionControl.BLOCK)
     assert eventually(lambda: publisher.put(b"tick") or len(got.items) > 20)
     assert set(got.items) == {4}
-    assert eventually(lambda: sender.put("a/small", bytes(7)) or 7 in got.items)
-    assert set(got.items) == {4, 7}
+    assert eventually(lambda: sender.put("a/largest", bytes(MAX_BYTES)) or MAX_BYTES in got.items)
+    assert set(got.items) == {4, MAX_BYTES}
 
 
 def test_a_request_in_a_closed_session_is_a_network_error(network):
