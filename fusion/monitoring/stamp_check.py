@@ -16,6 +16,7 @@ HISTORY, LEARNED = 64, 16  # frames of a camera, and how many of them define wha
 MIN_JUMP_NS = 4_000_000  # of lags, which vary with the time of detection
 EARLY_SHARE = 0.25  # of the usual lag above the smallest, by which the next one may be smaller still
 MIN_IRREGULAR = 0.1  # of the interval between frames
+MISSED = 1, 2, 3  # intervals in the usual step between stamps, of a busy machine
 MAX_SWAPPED = 12  # intervals by which a frame may overtake another
 
 
@@ -48,7 +49,9 @@ class StampCheck:
     def _jump(self, t_ns: int, lag: int) -> StampJump | None:
         stamps = sorted(self._stamps)
         steps = [after - before for before, after in pairwise(stamps)]
-        interval, since = max(1.0, median(steps)), t_ns - stamps[-1]
+        intervals = [max(1.0, median(steps)) / n for n in MISSED]
+        fitting = (T for T in intervals if all(_is_multiple(step, T) for step in steps))
+        interval, since = next(fitting, intervals[0]), t_ns - stamps[-1]
         if abs(since - interval) <= MIN_IRREGULAR * interval:
             return None  # the next frame; the lags of queued ones fall
         low, usual, high = min(self._lags), median(self._lags), max(self._lags)
@@ -56,9 +59,11 @@ class StampCheck:
         if low == high == lag:  # a recording without arrival times
             least, most = -math.inf, math.inf
         is_early, is_late = least > 0, most < 0 and since < interval
+        # Without that, a queue that ended, for which frames were skipped, looks like a jump.
+        is_before_sent = is_early and lag < 0
         if not all(_is_multiple(step, interval) for step in steps):
-            return StampJump(usual - lag, high - low + MIN_JUMP_NS) if is_early else None
-        if not is_early and self._is_regular(t_ns, interval):
+            return StampJump(usual - lag, high - low + MIN_JUMP_NS) if is_before_sent else None
+        if not is_before_sent and self._is_regular(t_ns, interval):
             return None
         longest = since - interval  # jump ahead; a smaller one if frames are missing too
         precision = max(abs(step - round(step / interval) * interval) for step in steps) + 1

@@ -94,3 +94,15 @@ def test_a_late_frame_is_no_jump():
     assert not any(
         check.add(t, t + round(1e6 * lag)) for t, lag in zip(regular(len(lags_ms)), lags_ms, strict=True)
     )
+
+
+@pytest.mark.parametrize("taken", [0.8, 0.4], ids=["some frames are skipped", "most frames are skipped"])
+def test_the_end_of_a_load_is_no_jump(taken: float):
+    """A busy machine takes some frames and sends them late; when the load ends, frames arrive sooner than any before,
+    after a frame that was skipped. They arrive after they were taken."""
+    for seed in range(N_RUNS):
+        rng, check = np.random.default_rng(seed), StampCheck()
+        stamps = [t for t in regular() if rng.random() < taken]
+        lags_ms = rng.uniform(60, 160, len(stamps)) * (np.arange(len(stamps)) < HISTORY // 2) + LAG_NS / 1e6
+        found = [check.add(t, t + round(1e6 * lag)) for t, lag in zip(stamps, lags_ms, strict=True)]
+        assert not any(found)
