@@ -224,7 +224,7 @@ def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
 
     Scouting is off unless the user's file enables it.
     """
-    config = _read(path) if path else zenoh.Config()
+    config = read_config(path) if path else zenoh.Config()
     for key in ("scouting/multicast/enabled", "scouting/gossip/enabled"):
         if config.get_json(key) == "null":
             config.insert_json5(key, "false")
@@ -235,7 +235,8 @@ def _config(path: Path | None, options: Mapping[str, object]) -> zenoh.Config:
     return config
 
 
-def _read(path: Path) -> zenoh.Config:
+def read_config(path: Path) -> zenoh.Config:
+    """Read a Zenoh configuration. Raises ConfigError if it is missing or invalid."""
     if not path.is_file():
         raise ConfigError(f"{path} does not exist; check the path of the Zenoh configuration")
     try:

@@ -48,8 +48,13 @@ class Serve:
         path, endpoints_file = settings.pop("config"), settings.pop("endpoints_file")
         config = in_zone(load_arena(path) if path else ArenaConfig(), settings.pop("zone"))
         config = override(config, **settings)
-        with stopped_by_signals() as stop, Server(config, stop) as server:
-            if endpoints_file:
-                write_atomically(endpoints_file, "".join(f"{endpoint}\n" for endpoint in server.endpoints))
-            server.run()
+        with stopped_by_signals() as stop:
+            while not stop.is_set():
+                with Server(config, stop) as server:
+                    config = override(config, listen=server.endpoints)
+                    if endpoints_file:
+                        write_atomically(
+                            endpoints_file, "".join(f"{endpoint}\n" for endpoint in server.endpoints)
+                        )
+                    server.run()
         return 0

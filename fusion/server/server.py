@@ -14,12 +14,12 @@ from pathlib import Path
 import msgspec
 
 from calib.rig.rig_messages import RigMessage
-from camera_node.foundation.errors import RoundelError
+from camera_node.foundation.errors import ConfigError, RoundelError
 from camera_node.foundation.folder_lock import locked_folder
 from camera_node.foundation.logs import about
 from camera_node.foundation.service import ServiceManager
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
-from camera_node.protocol.session import listening_endpoints
+from camera_node.protocol.session import listening_endpoints, read_config
 from camera_node.protocol.tcp_sockets import close_excess, stop_lingering
 from fusion.errors import FusionError
 from fusion.model.corrections import ExtrinsicsCorrection
@@ -63,7 +63,7 @@ MAX_LAG_NS = 500_000_000  # of the server; it drops the frames that it can't pro
 
 
 class Server:
-    """One arena's server; a context manager. `run` serves until `stop`.
+    """One arena's server; a context manager. `run` serves until `stop`, or until the Zenoh configuration changes.
 
     Args:
         config: its settings.
@@ -92,6 +92,7 @@ class Server:
         self._quotas = FrameQuotas(config.limits.lateness_ms, MAX_RATE_HZ)
         self._max_lag_ns = max(MAX_LAG_NS, round(config.limits.lateness_ms * 1e6))
         self._stopped = stopped or threading.Event()
+        self._zenoh = self._read_zenoh()
 
     def __enter__(self) -> "Server":
         with self._closing as stack:
@@ -122,7 +123,11 @@ class Server:
         self._stopped.set()
 
     def run(self) -> None:
-        """Serve: receive, synchronize, track and publish, report the status."""
+        """Serve: receive, synchronize, track and publish, report the status.
+
+        Zenoh reads rules only when a session opens. Where the file of `config.zenoh` changes, `run` returns, so that a
+        server that is opened anew withdraws the rights of revoked certificates.
+        """
         with (
             ServiceManager() as service,
             collecting_between_frame_sets() as collect_garbage,
@@ -142,6 +147,8 @@ class Server:
                         stop_lingering()  # of connections that are new since the last status
                         self._limit_connections()
                         collect_garbage()
+                        if self._has_new_rules():
+                            return
                 service.progress()
 
     def _declare(self) -> None:
@@ -190,6 +197,23 @@ class Server:
                 MAX_OF_ADDRESS,
                 extra=about(address),
             )
+
+    def _read_zenoh(self) -> bytes | None:
+        with contextlib.suppress(OSError):
+            return Path(self.config.zenoh).read_bytes() if self.config.zenoh else None
+
+    def _has_new_rules(self) -> bool:
+        """Whether the file of the Zenoh configuration has changed and is valid; each version is judged once."""
+        before, self._zenoh = self._zenoh, self._read_zenoh()
+        if self._zenoh in (before, None):
+            return False
+        try:
+            read_config(Path(self.config.zenoh or ""))
+        except ConfigError as error:
+            log.error("%s; the rules before it stay in force", error)
+            return False
+        log.warning("%s has changed: all connections are opened anew, by its rules", self.config.zenoh)
+        return True
 
     def _is_used(self, camera: str) -> bool:
         rig = self.pipeline.active_rig.rig

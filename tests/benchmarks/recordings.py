@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Memory and time of the commands on recordings of any length: `python -m tests.benchmarks.recordings [--gb 0.5 2]`.
+"""Memory and time of the commands on recordings of any length: `python -m tests.benchmarks.recordings [--gb 0.5 2]`;
+with --damaged 200, what they say of a recording with one wrong byte.
 
 The recording has 8 cameras, 50 robots, and their poses, for as long as it takes to reach each size; a few seconds of
 messages are repeated with later times. A command's peak memory must not depend on the size. Times are given as a
 multiple of the recorded time.
 """
 
+import random
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,14 +20,18 @@ import msgspec
 import tyro
 from rich.table import Table
 
-from calib.rig.recording import RecordingWriter
+from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigMessage
+from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import console, say
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.protocol.pose_messages import RobotPose, Robots, robots_key
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
+from fusion.recordings.recording_files import trim_recording
 from tests.benchmarks.fusion_load import Load
+from tests.conftest import ROOT
+from tests.processes import run_program
 
 ARENA = "large"
 KEYS = Keys(ARENA)
@@ -47,18 +54,30 @@ COMMANDS = {
         f"export to {name}": ("export", "{path}", "{folder}/" + name)
         for name in ("x.csv", "x.tum", "x.parquet")
     },
+    "export to Foxglove": ("export", "{path}", "{folder}/foxglove.mcap"),
+    "export to Rerun": ("export", "{path}", "{folder}/x.rrd"),
     "export to a ROS 2 bag": ("export", "{path}", "{folder}/bag"),
+    "plot": ("plot", "{path}", "--out", "{folder}/x.png"),
+    "view": ("view", "--replay", "{path}", "--headless", "--seconds", "10"),
 }
+SAMPLE = ROOT / "configs" / "sample" / "recording.mcap"
 
 
-def main(gb: tuple[float, ...] = (0.25, 1.0), robots: int = 50, only: tuple[str, ...] = ("",)) -> None:
+def main(
+    gb: tuple[float, ...] = (0.25, 1.0), robots: int = 50, only: tuple[str, ...] = ("",), damaged: int = 0
+) -> None:
     """Print the peak memory of each command for each size of the recording.
 
     Args:
         gb: sizes of the recording, in GB.
         robots: with 4 markers each, seen by 8 free-running cameras at 60 Hz.
         only: commands whose names contain one of these texts.
+        damaged: in place of it, give each command copies of a short recording with one wrong byte, at so many places.
     """
+    if damaged:
+        sys.exit(
+            not try_damaged(damaged, {n: c for n, c in COMMANDS.items() if any(text in n for text in only)})
+        )
     load = Load(robots=robots, period_s=BLOCK_S)
     columns = [heading for size in gb for heading in (f"{size:g} GB: MB", "of its time")]
     table = Table("command", *columns)
@@ -112,6 +131,41 @@ def repeated(
             yield KEYS.detections(shifted.camera), shifted
         else:
             yield KEYS.robot_pose(shifted.robot), shifted
+
+
+def try_damaged(n: int, commands: dict[str, tuple[str, ...]]) -> bool:
+    """Whether each command says what is missing of each copy, and ends as it should."""
+    noise, failed, n_lost = random.Random(1), 0, 0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        trim_recording(SAMPLE, folder / "whole.mcap", 2.0, 4.0)
+        whole = (folder / "whole.mcap").read_bytes()
+        n_whole = sum(1 for _ in read_messages(folder / "whole.mcap"))
+        for at in (noise.randrange(len(whole)) for _ in range(n)):
+            data = bytearray(whole)
+            data[at] ^= 1 << noise.randrange(8)
+            path, faults = folder / "large.mcap", Counter[str]()
+            path.write_bytes(data)
+            try:
+                is_lost = sum(1 for _ in read_messages(path, faults)) < n_whole
+            except ConfigError:
+                is_lost = True  # the first bytes are not those of the format
+            n_lost += is_lost
+            for command, arguments in commands.items():
+                path.write_bytes(data)
+                done = run_program(
+                    "fusion", *(a.format(path=path, cut=path, folder=folder) for a in arguments)
+                )
+                said = done.stdout + done.stderr
+                is_named = not is_lost or "skipped" in said or "not an MCAP" in said
+                if done.returncode not in (0, 2) or "Traceback" in said or not is_named:
+                    failed += 1
+                    say(f"byte {at}, {command}: exit code {done.returncode}: {said[-500:]} {dict(faults)}")
+                for left in folder.iterdir():
+                    if left.name not in ("large.mcap", "whole.mcap"):
+                        subprocess.run(["rm", "-r", left], check=True)
+    say(f"{n} bytes, {n_lost} of which cost messages; {len(commands)} commands: {failed} failures")
+    return not failed
 
 
 def run(arguments: tuple[str, ...], path: Path, folder: Path) -> tuple[float, float, int]:

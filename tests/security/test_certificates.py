@@ -6,6 +6,7 @@ import shutil
 import socket
 import ssl
 import subprocess
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -13,11 +14,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from tests.security.lab import KEYS, Lab, certificates
-from tests.waiting import DEADLINE_S, Inbox, wait_for
+from camera_node.foundation.errors import NetworkError
+from camera_node.protocol.session import listening_endpoints, open_client, open_router
+from tests.security.lab import CONFIGS, KEYS, Lab, certificates
+from tests.waiting import DEADLINE_S, Inbox, slowness, wait_for
 
 DAY_S = 86_400
 ANSWER_S = 2.0
+REVOCATION_S = 60.0
 EXPIRY_S = 5.0  # enough to connect on a busy machine
 
 
@@ -144,16 +148,24 @@ def test_renewal_replaces_certificates_while_old_ones_are_valid(tmp_path: Path):
 
 
 def test_a_revoked_certificate_has_no_rights_and_its_successor_has(tmp_path: Path):
-    """The thief of a camera's key can connect, and neither publish, nor ask, nor receive."""
+    """While the server runs: the thief of a camera's key can connect, and neither publish, nor ask, nor receive.
+
+    Before, the rights lasted until somebody started the server again.
+    """
     certificates(tmp_path, "localhost", "camera.north", "viewer").check_returncode()
     shutil.copytree(tmp_path / "camera.north", tmp_path / "stolen")
-    certificates("--revoke", tmp_path, "camera.north").check_returncode()
-    certificates(tmp_path, "localhost", "camera.north").check_returncode()
     key = KEYS.detections("north")
     with contextlib.ExitStack() as closing:
         lab = Lab(tmp_path, closing)
         inbox = closing.enter_context(collecting(lab, key))
-        thief, camera = lab.bare_session("stolen", "client"), lab.session("camera.north")
+        thief = lab.session("stolen")
+        require_rights(thief)
+        certificates("--revoke", tmp_path, "camera.north").check_returncode()
+        revoked_s = time.monotonic()
+        wait_for(lambda: not has_rights(thief))
+        assert time.monotonic() - revoked_s < REVOCATION_S
+        certificates(tmp_path, "localhost", "camera.north").check_returncode()
+        camera = lab.session("camera.north")
         thief.put(key, b"forged")
         require_rights(camera)
         assert not has_rights(thief)
@@ -167,6 +179,32 @@ def test_a_revoked_camera_has_no_rule(tmp_path: Path):
     text = (tmp_path / "server" / "zenoh" / "server.json5").read_text()
     assert "south" in text
     assert "north" not in text
+
+
+def with_certificate(keys: Path, template: str, name: str) -> Path:
+    """The links of the Zenoh configuration `template`, without rules, with the certificate of `name`."""
+    path = keys / f"{name}-{template}"
+    links, rules, _ = (CONFIGS / template).read_text().partition("access_control")
+    path.write_text(links.replace('"tls/', f'"{keys / name}/tls/') + ("}" if rules else ""))
+    return path
+
+
+def test_only_the_server_s_certificate_makes_a_server(tmp_path: Path):
+    """Clients and servers of other zones connect to no program that listens with the certificate of another role."""
+    certificates(tmp_path, "localhost", "camera.north", "viewer").check_returncode()
+    listen = ["tls/127.0.0.1:0"]
+    for listener in ("server", "camera.north", "viewer"):
+        with open_router(listen, with_certificate(tmp_path, "server.json5", listener)) as router:
+            for client in ("viewer", "server"):
+                given = (
+                    listening_endpoints(router, listen),
+                    with_certificate(tmp_path, "member.json5", client),
+                )
+                if listener == "server":
+                    open_client(*given, DEADLINE_S).close()
+                else:
+                    with pytest.raises(NetworkError):
+                        open_client(*given, 0.3 * slowness())
 
 
 def handshake(lab: Lab, folder: Path) -> None:
