@@ -11,7 +11,7 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -177,12 +177,18 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 @contextlib.contextmanager
-def hidden_folder(path: Path) -> Iterator[Path]:
+def hidden_folder(path: Path, own: Collection[str] = ()) -> Iterator[Path]:
     """An empty folder beside `path`, for what is moved to `path` once it is complete; it is removed at the end.
 
+    Args:
+        path: a file, or a folder that does not exist or has only files with the names `own`, an older result.
+        own: of the files of a result that is a folder.
+
     Raises:
-        ConfigError: it can't be written, or the disk is full.
+        ConfigError: `path` is another folder, it can't be written, or the disk is full.
     """
+    if path.is_dir() and not (own and path.name and {file.name for file in path.iterdir()} <= {*own}):
+        raise ConfigError(f"{path} is a folder with other files; give the name of a new file")
     folder = path.with_name(f".{path.name}.part")
     try:
         shutil.rmtree(folder, ignore_errors=True)  # of a program that was killed
@@ -195,16 +201,15 @@ def hidden_folder(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def new_path(path: Path) -> Iterator[Path]:
+def new_path(path: Path, own: Collection[str] = ()) -> Iterator[Path]:
     """Where to write a file or folder that appears at `path` complete at the end, or not at all after an error.
 
-    Raises:
-        ConfigError: it can't be written, or the disk is full.
+    `path`, `own` and what is raised: as in `hidden_folder`.
     """
-    with hidden_folder(path) as folder:
+    with hidden_folder(path, own) as folder:
         yield folder / path.name
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
+        for name in own:
+            (path / name).unlink(missing_ok=True)
         os.replace(folder / path.name, path)
 
 

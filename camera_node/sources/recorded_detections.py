@@ -2,22 +2,24 @@
 """Reads recorded detections as `Detections` messages: from folders of frames, or from `observations.csv`."""
 
 import csv
+import math
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
-from camera_node.foundation.config import require_name
-from camera_node.foundation.errors import CameraError, ConfigError, unwritable
+from camera_node.foundation.config import new_path, require_name
+from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.foundation.terminal import track
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_frames import FrameFolder, VideoFile, inner_folders
 
 SIGMA_PX = 0.3  # assumed standard deviation of a centre from a file without covariances
 MAX_FPS = 1e5
-Rows = dict[tuple[int, str], list[tuple[float, float, int, float]]]
+Rows = dict[tuple[int, str], list[tuple[float, float, int, float, float]]]
 
 
 def detect_frames(folder: Path, **settings) -> list[Detections]:
@@ -81,9 +83,11 @@ def detect_video(path: Path, **settings) -> Iterator[Detections]:
 def read_observations(
     path: Path, sizes: dict[str, tuple[int, int]] | None = None, fps: float | None = None
 ) -> list[Detections]:
-    """Read `observations.csv`: columns t_ns, camera, u, v and optionally marker and sigma_px, one row for each centre.
+    """Read `observations.csv`: columns t_ns, camera, u, v and optionally marker, code and sigma_px, one row for each
+    centre.
 
-    Instead of t_ns, the number of the frame can be given, in the column frame.
+    Instead of t_ns, the number of the frame can be given, in the column frame. A marker's number is that of the body to
+    calibrate with, a code is printed.
 
     Args:
         path: the file.
@@ -91,7 +95,7 @@ def read_observations(
         fps: frames a second, for a file with numbers of frames.
 
     Returns:
-        one message for each camera and time, in order of time; `marker` becomes `id`.
+        one message for each camera and time, in order of time; `code`, or else `marker`, becomes `id`.
 
     Raises:
         ConfigError: the file is missing, lacks a column, or has a row with invalid values, or frames without `fps`.
@@ -118,25 +122,23 @@ def read_observations(
 
 
 def write_observations(path: Path, messages: Iterable[Detections]) -> None:
-    """Write detections as `observations.csv`.
+    """Write detections as `observations.csv`; it appears complete or not at all.
 
     Raises:
         ConfigError: the file can't be written.
     """
-    try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["t_ns", "camera", "u", "v", "marker"])
-            writer.writerows(_flatten(messages))
-    except OSError as error:
-        raise unwritable(path, error) from None
+    with new_path(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t_ns", "camera", "u", "v", "marker", "code"])
+        writer.writerows(_flatten(messages))
 
 
 def _flatten(messages: Iterable[Detections]) -> Iterator[tuple]:
     for message in messages:
         for roundel in message.unpack():
-            number = "" if roundel.id is None else roundel.id
-            yield message.t_ns, message.camera, f"{roundel.uv[0]:.4f}", f"{roundel.uv[1]:.4f}", number
+            u, v = (f"{pixels:.4f}" for pixels in roundel.uv)
+            is_code = math.isfinite(roundel.id_probability)
+            yield message.t_ns, message.camera, u, v, *((None, roundel.id) if is_code else (roundel.id, None))
 
 
 def _read_rows(file: Iterable[str], path: Path, fps: float | None) -> Rows:
@@ -145,7 +147,8 @@ def _read_rows(file: Iterable[str], path: Path, fps: float | None) -> Rows:
     rows: Rows = {}
     for row in reader:
         try:
-            u, v, number = float(row["u"]), float(row["v"]), int(row.get("marker") or -1)
+            u, v, code = float(row["u"]), float(row["v"]), row.get("code")
+            number = int(code or row.get("marker") or -1)
             sigma = float(row.get("sigma_px") or SIGMA_PX)
             t_ns, in_range = (
                 read_time(row),
@@ -153,7 +156,9 @@ def _read_rows(file: Iterable[str], path: Path, fps: float | None) -> Rows:
             )  # False for NaN
             if not (in_range and row["camera"] and 0 <= t_ns < 2**63 and -1 <= number < 2**31):
                 raise ValueError
-            rows.setdefault((t_ns, row["camera"]), []).append((u, v, number, sigma))
+            rows.setdefault((t_ns, row["camera"]), []).append(
+                (u, v, number, sigma, 1.0 if code else math.nan)
+            )
         except (TypeError, ValueError, OverflowError):
             raise ConfigError(
                 f"{path}, line {reader.line_num}: invalid values; t_ns and frame must be integers, u and v pixels, "
@@ -183,5 +188,6 @@ def _message(key: tuple[int, str], points: list, seqs: dict[str, int], size: tup
     seqs[camera] = seqs.get(camera, -1) + 1
     columns = np.array(points)
     roundels = Roundels.from_points(columns[:, :2], columns[:, 3], columns[:, 2].astype(np.int32))
+    roundels = replace(roundels, id_probability=columns[:, 4])
     width, height = size
     return Detections.pack(roundels, camera=camera, seq=seqs[camera], t_ns=t_ns, width=width, height=height)

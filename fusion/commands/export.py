@@ -5,6 +5,7 @@ from pathlib import Path
 
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
+from camera_node.sources.recorded_detections import write_observations
 from fusion.export.points import sample_points
 from fusion.export.pose_formats import (
     FORMATS,
@@ -19,6 +20,7 @@ from fusion.export.pose_formats import (
     write_tum,
 )
 from fusion.export.recorded_poses import RecordedPoses
+from fusion.recordings.arena_recording import read_recording
 from fusion.recordings.recording_files import say_skipped
 
 WRITERS = {
@@ -40,13 +42,13 @@ def export(
     rate_hz: float | None = None,
     force: bool = False,
 ) -> int:
-    """Write the poses of a recording (MCAP) in the format of another program.
+    """Write the poses of a recording (MCAP) in the format of another program, or its detections as observations.csv.
 
     Args:
         recording: the MCAP file of roundel record or roundel replay.
         out: the file to write: .c3d, .trc, .csv, .tum, .parquet, .rrd for Rerun, or .mcap
             for Foxglove; without suffix a ROS 2 bag, a folder.
-        format: the format, if the suffix does not say it.
+        format: the format, if the suffix does not say it; observations for the detections of all cameras.
         robots: names of the robots to write; all unless given.
         rate_hz: frames a second (C3D, TRC); the rate of the poses unless given.
         force: replace what exists.
@@ -59,6 +61,12 @@ def export(
         )
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another name, or --force to replace it")
+    if chosen == "observations":
+        recorded = read_recording(recording)
+        write_observations(out, (message for _, message in recorded.detections))
+        say_skipped(recorded.faults)
+        say(f"wrote {out}: {len(recorded.detections)} frames")
+        return 0
     poses = RecordedPoses(recording, robots)
     files = _write(chosen, poses, out, rate_hz)
     say_skipped(poses.faults)

@@ -24,7 +24,7 @@ from fusion.export.points import PointTrajectories
 from fusion.export.recorded_poses import RecordedPoses
 from fusion.protocol.pose_messages import RobotPose
 
-Format = Literal["c3d", "trc", "csv", "tum", "parquet", "rerun", "rosbag", "foxglove"]
+Format = Literal["c3d", "trc", "csv", "tum", "parquet", "rerun", "rosbag", "foxglove", "observations"]
 FORMATS: dict[str, Format] = {  # of `roundel export`, by suffix
     ".c3d": "c3d",
     ".trc": "trc",
@@ -206,7 +206,7 @@ def write_rosbag(poses: RecordedPoses, path: Path) -> None:
     typesys = require("rosbags.typesys", "export", "a ROS 2 bag")
     types, connections = typesys.get_typestore(typesys.Stores.ROS2_JAZZY), {}
     with (
-        new_path(path) as part,
+        new_path(path, own=("metadata.yaml", f"{path.name}.mcap")) as part,
         rosbag2.Writer(part, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer,
     ):
 

@@ -54,6 +54,7 @@ COMMANDS = {
         f"export to {name}": ("export", "{path}", "{folder}/" + name)
         for name in ("x.csv", "x.tum", "x.parquet")
     },
+    "export to observations": ("export", "{path}", "{folder}/x.csv", "--format", "observations"),
     "export to Foxglove": ("export", "{path}", "{folder}/foxglove.mcap"),
     "export to Rerun": ("export", "{path}", "{folder}/x.rrd"),
     "export to a ROS 2 bag": ("export", "{path}", "{folder}/bag"),

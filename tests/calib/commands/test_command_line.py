@@ -98,7 +98,7 @@ def test_an_error_is_one_line_and_nothing_is_overwritten(
     tmp_path: Path, arena: Arena, file: str, text: str, fault: str
 ):
     rows = (tmp_path / "observations.csv").read_text().splitlines()
-    unnumbered = [row.rsplit(",", 1)[0] for row in rows]
+    unnumbered = [row.rsplit(",", 2)[0] for row in rows]
     (tmp_path / "observations.csv").write_text("\n".join(unnumbered) + "\n")
     (tmp_path / "rig.yaml").write_text("precious")
     (tmp_path / file).write_text(text)

@@ -2,6 +2,7 @@
 """observations.csv: a written file is read back unchanged, and an error names the line of an invalid row."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,12 @@ from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import detect_frames, read_observations, write_observations
 
+CODE = 7
+
 
 def message(camera: str, seq: int, t_ns: int, uv: np.ndarray, numbers: list[int]) -> Detections:
     roundels = Roundels.from_points(uv, 0.3, np.array(numbers, np.int32))
+    roundels = replace(roundels, id_probability=np.where(np.array(numbers) == CODE, 1.0, np.nan))
     return Detections.pack(roundels, camera=camera, seq=seq, t_ns=t_ns, width=640, height=480)
 
 
@@ -22,7 +26,7 @@ def test_observations_are_read_as_they_were_written(tmp_path: Path):
     """Pixels are written with four decimals, which rounds them by up to half of the last one."""
     rng, path = np.random.default_rng(2), tmp_path / "observations.csv"
     sent = [
-        message(camera, k, 10**18 + 33 * k + i, rng.uniform(0, 480, (3, 2)), [k, -1, 7])
+        message(camera, k, 10**18 + 33 * k + i, rng.uniform(0, 480, (3, 2)), [k, -1, CODE])
         for k in range(4)
         for i, camera in enumerate(("cam0", "north-2"))
     ]
@@ -34,6 +38,7 @@ def test_observations_are_read_as_they_were_written(tmp_path: Path):
     for a, b in zip(got, sent, strict=True):
         np.testing.assert_allclose(a.unpack().uv, b.unpack().uv, atol=0.5001e-4)
         np.testing.assert_array_equal(a.unpack().id, b.unpack().id)
+        np.testing.assert_array_equal(a.unpack().id_probability, b.unpack().id_probability)  # it is a code
         a.check()
 
 

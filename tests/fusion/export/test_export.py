@@ -16,19 +16,23 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from calib.rig.camera import Camera
-from calib.rig.recording import RecordingWriter, read_messages
+from calib.rig.recording import RecordingWriter, read_detections, read_messages
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import Pose, rotation_from_wxyz
 from camera_node.protocol.messages import encode
+from camera_node.sources.recorded_detections import read_observations
+from fusion.__main__ import execute
 from fusion.commands.export import export
 from fusion.export import pose_formats
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import RobotPose, Robots
+from tests.conftest import ROOT
 from tests.fusion.bridges.foxglove_reader import read_mcap
 from tests.fusion.bridges.pose_server import moving_pose
 from tests.missing_package import advice_without
+from tests.processes import run_here
 
 START_NS, RATE_HZ, N = 1_790_000_000_000_000_000, 60, 180
 BODY = Robot(diameter_m=0.09, markers=((0.1, 0.0, 0.0), (-0.1, 0.05, 0.0), (0.0, -0.1, 0.02)))
@@ -104,6 +108,36 @@ def test_parquet_is_read_by_pyarrow_and_pandas(
     assert (covariances == [pose.covariance_matrix for pose in poses]).all()
     assert list(table.frame_index) == [k for k in range(N) for _ in BODIES]
     assert (table.timestamp == (table.t_ns - START_NS) / 1e9).all()
+
+
+def test_observations_are_the_recorded_detections(tmp_path: Path):
+    """Of the sample: every centre, at its frame's time; frames without a roundel have no row."""
+    source, out = ROOT / "configs" / "sample" / "recording.mcap", tmp_path / "observations.csv"
+    assert export(source, out, format="observations") == 0
+    sent = {(m.camera, m.t_ns): m.unpack().uv for m in read_detections(source) if len(m)}
+    got = {(m.camera, m.t_ns): m.unpack().uv for m in read_observations(out)}
+    assert got.keys() == sent.keys()
+    for key, uv in sent.items():
+        np.testing.assert_allclose(got[key], uv, atol=0.5001e-4)
+
+
+@pytest.mark.parametrize("out", ["results", ".", "..", "results.d", "link"])
+@pytest.mark.parametrize("command", ["replay --out", "export --force", "export --force --format csv"])
+def test_a_result_replaces_no_folder(tmp_path: Path, command: str, out: str):
+    """Before, replay --out FOLDER and export FOLDER --force deleted the folder with all that was in it."""
+    source = ROOT / "configs" / "sample" / "recording.mcap"
+    inside = tmp_path / "here" / "inside"
+    for folder in ("results", "results.d"):
+        (inside / folder / "years").mkdir(parents=True)
+        (inside / folder / "years" / "of.mcap").write_text("work")
+    (inside / "link").symlink_to("results")
+    before = sorted(tmp_path.rglob("*"))
+    name, *options = command.split()
+    words = [source, *options, out] if name == "replay" else [source, out, *options]
+    done = run_here(lambda: execute([name, *map(str, words)]), inside)
+    assert done.returncode == 2, done.stdout
+    assert "Traceback" not in done.stderr
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_rerun_reads_its_recording(recording: Path, tmp_path: Path):
@@ -205,7 +239,8 @@ def test_tum_has_one_file_for_each_robot(recording: Path, tmp_path: Path):
 
 
 def test_a_ros_2_bag_has_the_messages_of_the_bridge(recording: Path, tmp_path: Path):
-    export(recording, tmp_path / "bag")
+    for is_again in (False, True):  # a bag replaces a bag
+        export(recording, tmp_path / "bag", force=is_again)
     expected = {(p.robot, p.t_ns): p for p in recorded_poses() if p.state != "lost"}
     counts: dict[str, int] = {}
     with AnyReader([tmp_path / "bag"]) as reader:
