@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Counts points in the cells of an image, and names the regions of the image that have few."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.foundation.arrays import Array, Mask
+from camera_node.foundation.arrays import Array, Index, Mask
 
 CELLS = (6, 8)  # rows and columns of the grid
 REGIONS = (
@@ -54,13 +55,20 @@ class Coverage:
         return sorted((name for name in shares if shares[name] < MIN_SHARE), key=shares.__getitem__)
 
 
-def choose_covering(counts: Array, most: int) -> Mask:
+def spread_evenly(count: int, most: int) -> Index:
+    """Up to `most` indices below `count`, evenly spaced."""
+    return np.linspace(0, count - 1, min(most, count)).round().astype(np.intp)
+
+
+def choose_covering(counts: Array, most: int, first: Sequence[int] | Index = ()) -> Mask:
     """(n,) at most `most` of n parts that together fill all cells evenly, from their points (n, cells) in each.
 
-    Greedy: each next part is the one with most points in cells that have few so far.
+    Greedy: after the parts `first`, each next one is that with most points in cells that have few so far.
     """
-    filled, chosen = np.zeros(counts.shape[1]), np.zeros(len(counts), bool)
-    for _ in range(min(most, len(counts))):
+    chosen = np.zeros(len(counts), bool)
+    chosen[list(first)] = True
+    filled = counts[chosen].sum(axis=0)
+    for _ in range(min(most, len(counts)) - int(chosen.sum())):
         best = int(np.where(chosen, -1.0, counts @ (1 / (1 + filled))).argmax())
         filled += counts[best]
         chosen[best] = True

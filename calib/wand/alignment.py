@@ -17,12 +17,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig.coverage import spread_evenly
 from calib.rig.estimation import GROSS, MARGIN
 from calib.rig.rig import Rig
 from calib.wand.body_poses import SIGMA_RAD
 from calib.wand.bundle_adjustment.problem import SLEWED_DRIFT
 from calib.wand.detections import FrameTable, MarkerTrack, Timing, WandDetections, gather, interpolate
-from calib.wand.initial_rig import MAX_SHIFT_S, MIN_MISFIT, SHIFT_SAMPLE, epipolar_misfits, spread_evenly
+from calib.wand.initial_rig import MAX_SHIFT_S, MIN_MISFIT, SHIFT_SAMPLE, epipolar_misfits
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections

@@ -6,7 +6,9 @@ Bartoli 2014 for coplanar markers, which have two solutions). The views of sever
 whatever markers, give one pose: the solution of one view that fits all of them best, adjusted to all. The markers are
 then points of known position, and a further camera is placed by its images of them at all instants together, robustly
 (RANSAC), then by least squares. Of an instant that only one camera saw, both solutions count: those of other instants
-decide. Markers on a line give no pose.
+decide. Markers on a line give no pose. A camera that never saw the wand at the instant of another one is placed by the
+wand's motion: its pose is extrapolated, at constant velocity, to the frame that saw it soonest before or after the
+others did.
 
 Relative poses of pairs of cameras are not averaged: the pose of a small part of the body is uncertain by degrees, and
 its two solutions by tens of degrees, while an image of it is uncertain by a fraction of a pixel.
@@ -19,16 +21,19 @@ import cv2
 import numpy as np
 
 from calib.rig.camera import FLAT, MIN_MARKERS, solve_view, span_dimension, transform
+from calib.rig.coverage import spread_evenly
 from calib.rig.estimation import MARGIN, STEPS
 from calib.wand.detections import MarkerTrack, WandDetections
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import invert, rotation_from_vector, skew
+from camera_node.geometry.pose import invert, rotation_from_vector, skew, vector_from_rotation
 
 MAX_VIEW = 32  # of a view, that are used to locate it
 SIGMA_RAD = 1.5e-3  # of a ray to a marker by a rough rig: 3 px of a lens of 2000 px
-GATE_RAD = 5 * SIGMA_RAD  # a ray farther from its marker is an outlier
+# Of a ray to a marker whose place the motion gives: a hand's 5 m/s^2 move it by 10 mm, 2 m away, in 60 ms.
+MOVING_RAD = 5e-3
+GATE = 5  # sigmas: a ray farther from its marker is an outlier
 TOLERANCE = 0.01  # the least gain of the cost in a step
 BEHIND = 1e-3  # m: a marker nearer to the camera, or behind it, counts as this far
 SWEEPS = 3  # in which all cameras are located in turn by the body
@@ -114,9 +119,10 @@ class BodyLocator:
         return [self.located[t] for t in times]
 
     def _locate(self, t_s: Array) -> list[list[Array]]:
-        views = self._views(t_s)
+        views, allowed = self._views(t_s), [list[Array]() for _ in t_s]
+        if not len(views.instant):
+            return allowed
         candidates, instant = self._solve(views)
-        allowed: list[list[Array]] = [[] for _ in t_s]
         if not len(candidates):
             return allowed
         rows, owner = _repeat(views.instant, instant)
@@ -133,6 +139,52 @@ class BodyLocator:
                 found.append(poses[c])
             least[k] = min(least[k], costs[c])
         return allowed
+
+    def handovers(self, t_s: Array) -> Array:
+        """Those of the times (K,) at which no camera sees a marker, but that are next to a frame of a placed one, and
+        near enough that the wand's motion about that frame gives its pose; `locate` knows it from now on."""
+        t_s, seen = t_s[~self.sees(t_s)], self._seen_s()
+        nearest: dict[
+            tuple[int, bool], float
+        ] = {}  # time by the number of the frame, and whether that is before
+        for t in t_s.tolist():
+            after = int(np.searchsorted(seen, t))
+            for k in range(max(after - 1, 0), min(after + 1, len(seen))):
+                name, apart = (k, bool(seen[k] < t)), abs(t - seen[k])
+                if apart <= self.gap_s and (name not in nearest or apart < abs(nearest[name] - seen[k])):
+                    nearest[name] = t
+        for (k, before), t in nearest.items():
+            reach = seen[k] + (-self.gap_s if before else self.gap_s)
+            far = (
+                int(np.searchsorted(seen, reach))
+                if before
+                else int(np.searchsorted(seen, reach, "right")) - 1
+            )
+            if far != k:
+                self.located[t] = self._extrapolate(float(seen[far]), float(seen[k]), t)
+        return np.array(sorted({t for t in nearest.values() if self.located.get(t)}))
+
+    def _seen_s(self) -> Array:
+        """The true times, ascending, of the frames in which placed cameras saw the wand."""
+        times = [track.t_s + self.offset_s[k] for k in self.poses for track in self.tracks[k]]
+        return np.unique(np.concatenate(times))
+
+    def _extrapolate(self, start: float, end: float, t: float) -> list[Array]:
+        """The poses T_world_wand at time t by constant velocity from `start` to `end`: of each pose at the end, from
+        the nearest one at the start."""
+        first, last = self.locate(np.array([start, end]))
+        share, poses = (t - end) / (end - start), []
+        for T in last if first else []:
+            apart = [
+                np.linalg.norm(transform(other, self.points) - transform(T, self.points)) for other in first
+            ]
+            before = first[int(np.argmin(apart))]
+            turn = vector_from_rotation(T[:3, :3] @ before[:3, :3].T)
+            moved = T.copy()
+            moved[:3, :3] = rotation_from_vector(share * turn) @ T[:3, :3]
+            moved[:3, 3] += share * (T[:3, 3] - before[:3, 3])
+            poses.append(moved)
+        return poses
 
     def sees(self, t_s: Array) -> Mask:
         """(K,) whether a camera sees a marker at the times (K,)."""
@@ -327,6 +379,7 @@ class _Images:
         points: (n, 3) world. A detection occurs once for each pose that the body may have in its frame.
         xy: (n, 2) image plane coordinates.
         pose, frame: (n,) numbers of the body's pose, ascending, and of the frame.
+        sigma: (n,) standard deviation of the ray to the point, rad.
         frame_of_pose: (P,).
     """
 
@@ -334,13 +387,8 @@ class _Images:
     xy: Array
     pose: Index
     frame: Index
+    sigma: Array
     frame_of_pose: Index
-
-    def select(self, chosen: Mask) -> "_Images":
-        """The images that a mask (n,) selects."""
-        return _Images(
-            self.points[chosen], self.xy[chosen], self.pose[chosen], self.frame[chosen], self.frame_of_pose
-        )
 
     def errors(self, T_cam_world: Array) -> Array:
         """(n,) distances in the image plane; infinite behind the camera."""
@@ -349,8 +397,13 @@ class _Images:
             error = np.linalg.norm(p[:, :2] / p[:, 2:] - self.xy, axis=1)
         return np.where(p[:, 2] > 0, error, np.inf)
 
-    def choose(self, T_cam_world: Array, sigma: float) -> tuple[float, Mask]:
-        """Cauchy's cost with the pose of the body in each frame that fits best, and (n,) the images of these poses."""
+    def fits(self, T_cam_world: Array) -> Mask:
+        """(n,) the images near their points."""
+        return self.errors(T_cam_world) < GATE * self.sigma
+
+    def choose(self, T_cam_world: Array, sigma: Array | float) -> tuple[float, Mask]:
+        """Cauchy's cost by these standard deviations, with the pose of the body in each frame that fits best, and (n,)
+        the images of these poses."""
         cost = np.log1p(np.minimum(self.errors(T_cam_world) / sigma, 1e6) ** 2 / 2)
         by_pose = np.bincount(self.pose, 2 * cost, len(self.frame_of_pose))
         order = np.lexsort((by_pose, self.frame_of_pose))
@@ -366,8 +419,8 @@ def _place(
     images = _collect(locator, detections)
     if images is None:
         return (
-            "no other camera that is placed saw four markers of the wand when it did; show them the wand at once, each "
-            "any side of the wand"
+            "no other camera that is placed saw four markers of the wand when it did, or just before or after; show "
+            "them the wand at once, each any side of the wand"
         )
     if len(images.points) < MIN_MARKERS or span_dimension(images.points) < 2:
         return (
@@ -376,8 +429,8 @@ def _place(
     starts = list(_starts(images)) if start is None else [invert(start)]
     # Of one pose of the body, an error moves the camera with it, and only noise remains; of several, errors differ.
     single = len(np.unique(images.frame)) == 1
-    sigma = 2 * DETECTION_PX / (lens.fx + lens.fy) if single else SIGMA_RAD
-    starts = sorted(starts, key=lambda T: images.choose(T, SIGMA_RAD)[0])[:REFINED]
+    sigma = 2 * DETECTION_PX / (lens.fx + lens.fy) if single else images.sigma
+    starts = sorted(starts, key=lambda T: images.choose(T, images.sigma)[0])[:REFINED]
     refined = [T for T in (_refine_camera(images, T, sigma) for T in starts) if T is not None]
     if not refined:
         return NO_FIT
@@ -390,7 +443,7 @@ def _place(
             f"its {len(np.unique(images.frame))} frames with the wand allow two poses, because their markers are "
             "nearly in one plane; show it another side of the wand, or the same one more slanted"
         )
-    inlier = chosen & (images.errors(T) < GATE_RAD)
+    inlier = chosen & images.fits(T)
     frames, share = len(np.unique(images.frame[inlier])), inlier.sum() / chosen.sum()
     if inlier.sum() < MIN_MARKERS or share < (MIN_SHARE if frames >= FEW_FRAMES else MIN_SHARE_OF_FEW):
         return NO_FIT
@@ -398,10 +451,13 @@ def _place(
 
 
 def _collect(locator: BodyLocator, detections: WandDetections) -> _Images | None:
-    """The images in up to `FRAMES` frames in which the locator knows the body's pose; None without any."""
-    times = np.unique(detections.t_s)
-    times = times[locator.sees(times)]
-    times = times[np.linspace(0, len(times) - 1, min(FRAMES, len(times))).round().astype(int)]
+    """The images in up to `FRAMES` frames in which the locator knows the body's pose, of few also those at handovers;
+    None without any."""
+    every = np.unique(detections.t_s)
+    seen = every[locator.sees(every)]
+    moving = locator.handovers(every) if len(seen) < FEW_FRAMES else seen[:0]
+    times = np.union1d(seen, moving)
+    times = times[spread_evenly(len(times), FRAMES)]
     points, rows, pose, frame_of_pose = [], [], [], []
     for frame, (t, allowed) in enumerate(zip(times.tolist(), locator.locate(times), strict=True)):
         mine = np.flatnonzero(detections.t_s == t)
@@ -412,9 +468,9 @@ def _collect(locator: BodyLocator, detections: WandDetections) -> _Images | None
             frame_of_pose.append(frame)
     if not rows:
         return None
-    number = np.array(frame_of_pose)
-    poses = np.concatenate(pose)
-    return _Images(np.concatenate(points), detections.xy[np.concatenate(rows)], poses, number[poses], number)
+    number, poses, row = np.array(frame_of_pose), np.concatenate(pose), np.concatenate(rows)
+    sigma = np.where(np.isin(detections.t_s[row], moving), MOVING_RAD, SIGMA_RAD)
+    return _Images(np.concatenate(points), detections.xy[row], poses, number[poses], sigma, number)
 
 
 def _starts(images: _Images) -> Iterator[Array]:
@@ -422,7 +478,7 @@ def _starts(images: _Images) -> Iterator[Array]:
     if (T := _ransac(images)) is not None:
         yield T
     poses = np.unique(images.pose)
-    for pose in poses[np.linspace(0, len(poses) - 1, min(FRAMES // 16, len(poses))).round().astype(int)]:
+    for pose in poses[spread_evenly(len(poses), FRAMES // 16)]:
         mine = images.pose == pose
         yield from solve_view(images.points[mine], images.xy[mine])
 
@@ -430,7 +486,11 @@ def _starts(images: _Images) -> Iterator[Array]:
 def _ransac(images: _Images) -> Array | None:
     """T_cam_world that most images fit; None where none is found."""
     cv2.setRNGSeed(0)
-    options = {"iterationsCount": TRIALS, "reprojectionError": GATE_RAD, "confidence": 0.9999}
+    options = {
+        "iterationsCount": TRIALS,
+        "reprojectionError": GATE * images.sigma.max(),
+        "confidence": 0.9999,
+    }
     try:
         found, turn, shift, _ = cv2.solvePnPRansac(
             images.points, images.xy, np.eye(3), None, **options, flags=cv2.SOLVEPNP_SQPNP
@@ -444,10 +504,10 @@ def _ransac(images: _Images) -> Array | None:
     return T
 
 
-def _refine_camera(images: _Images, T: Array, sigma: float) -> Array | None:
+def _refine_camera(images: _Images, T: Array, sigma: Array | float) -> Array | None:
     """The pose adjusted to the images near its own; None where these are too few."""
     for _ in range(SWEEPS):
-        inlier = images.choose(T, sigma)[1] & (images.errors(T) < GATE_RAD)
+        inlier = images.choose(T, sigma)[1] & images.fits(T)
         if inlier.sum() < MIN_MARKERS or span_dimension(images.points[inlier]) < 2:
             return None
         turn, shift = cv2.solvePnPRefineLM(

@@ -16,11 +16,12 @@ import cv2
 import msgspec
 import numpy as np
 
+from calib.rig.coverage import spread_evenly
 from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_weights
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import FOCAL, calibrated_sigma
 from calib.wand.bundle_adjustment.problem_setup import MIN_SIGMA_PX
-from calib.wand.initial_rig import GATE_PX, MIN_COMMON, TwoViewGeometry, sampson, spread_evenly
+from calib.wand.initial_rig import GATE_PX, MIN_COMMON, TwoViewGeometry, sampson
 from calib.wand.labels import label_recording
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.body import Body

@@ -20,6 +20,7 @@ import numpy as np
 
 from calib.errors import CameraFault
 from calib.rig.camera import transform
+from calib.rig.coverage import spread_evenly
 from calib.wand.body_poses import BodyPlacement, has_poses
 from calib.wand.detections import (
     SAME_S,
@@ -336,11 +337,6 @@ def find_shift(
     fine = coarse[best] + step_s * np.linspace(-1, 1, 11)
     misfits = epipolar_misfits(xy, interpolate(tracks, label, t_s + fine[:, None], gap_s))
     return float(fine[np.argmin(misfits)])
-
-
-def spread_evenly(count: int, most: int) -> Index:
-    """Return up to `most` indices below `count`, evenly spaced."""
-    return np.linspace(0, count - 1, min(most, count)).round().astype(np.intp)
 
 
 def supports_shift(unshifted: float, shifted: float, correspondences: int, times: int) -> bool:

@@ -11,9 +11,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from calib.rig.camera import transform
-from calib.rig.coverage import choose_covering
+from calib.rig.coverage import choose_covering, spread_evenly
 from calib.rig.estimation import CLEAR
 from calib.rig.triangulation import intersect_images
 from calib.wand.body_poses import BodyLocator, has_poses
@@ -100,6 +101,7 @@ def _locate_missing(
         dict(enumerate(offset_s.tolist())),
         recording.timing.gap_s,
     )
+    locator.handovers(knot_s[missing])
     basis, markers = basis.copy(), points[AffineWand.of(recording.wand).basis]
     for k, allowed in zip(missing.tolist(), locator.locate(knot_s[missing]), strict=True):
         if allowed:
@@ -122,26 +124,57 @@ def _choose_detections(recording: WandRecording, offset_s: Array, budget: int) -
     detections = recording.detections
     true_s = detections.t_s + offset_s[detections.camera]
     order = np.argsort(true_s, kind="stable")
-    frame_set = _frame_sets(recording, true_s, order)
+    group = _groups(recording, true_s)
+    apart = group.max() > 0
+    frame_set = _frame_sets(recording, true_s, order, 1 if apart else 2)
     rows = order[frame_set[order] >= 0]
     sizes = np.array([(lens.width, lens.height) for lens in recording.lenses], float)
-    chosen = choose_frame_sets(detections.select(rows), frame_set[rows], sizes, budget)
+    selected, numbers = detections.select(rows), frame_set[rows]
+    between = np.flatnonzero(_handovers(numbers, group[selected.camera])) if apart else numbers[:0]
+    chosen = choose_frame_sets(selected, numbers, sizes, budget, between)
     rows = rows[chosen[frame_set[rows]]]
     knot = np.unique(frame_set[rows], return_inverse=True)[1]
     return rows, knot, _middle_times(true_s[rows], knot)
 
 
-def _frame_sets(recording: WandRecording, true_s: Array, order: Index) -> Index:
-    """(n,) the frame set of every detection, -1 where only one camera has a frame."""
+def _groups(recording: WandRecording, true_s: Array) -> Index:
+    """(C,) the group of each camera: those of different groups never saw the wand at once, so that only its motion as a
+    rigid body connects them."""
+    cameras, gap_s = range(len(recording.lenses)), recording.timing.gap_s
+    if not gap_s or not has_poses(recording.wand):
+        return np.zeros(len(cameras), np.intp)
+    times = [np.unique(true_s[recording.detections.camera == k]) for k in cameras]
+    at_once = [[_covers(times[a], times[b], gap_s) for b in cameras] for a in cameras]
+    return np.asarray(connected_components(np.array(at_once), directed=False)[1], np.intp)
+
+
+def _covers(frame_s: Array, t_s: Array, gap_s: float) -> bool:
+    """Whether any of the times (n,) lies between two frames at most `gap_s` apart."""
+    after = np.searchsorted(frame_s, t_s)
+    inside = (after > 0) & (after < len(frame_s))
+    return bool((frame_s[after[inside]] - frame_s[after[inside] - 1] <= gap_s).any())
+
+
+def _frame_sets(recording: WandRecording, true_s: Array, order: Index, least: int) -> Index:
+    """(n,) the frame set of every detection, -1 where fewer than `least` cameras have a frame."""
     detections = recording.detections
     frames, first, back = np.unique(detections.frame[order], return_index=True, return_inverse=True)
     t_s, camera = true_s[order][first], detections.camera[order][first]
     by_time = np.argsort(t_s, kind="stable")
     of_frame = np.empty(len(frames), np.intp)
-    of_frame[by_time] = group_frames(t_s[by_time], camera[by_time], recording.timing.spread_s)
+    of_frame[by_time] = group_frames(t_s[by_time], camera[by_time], recording.timing.spread_s, least)
     frame_set = np.empty(len(order), np.intp)
     frame_set[order] = of_frame[back]
     return frame_set
+
+
+def _handovers(frame_set: Index, group: Index) -> Mask:
+    """(K,) the frame sets next to one that another group of cameras saw, or that two saw, from the ascending frame sets
+    (n,) of detections and the groups (n,) of their cameras."""
+    first = np.flatnonzero(np.diff(frame_set, prepend=-1))
+    least, most = np.minimum.reduceat(group, first), np.maximum.reduceat(group, first)
+    changes = least[1:] != most[:-1]
+    return (least != most) | np.append(changes, False) | np.append(False, changes)
 
 
 def _middle_times(t_s: Array, knot: Index) -> Array:
@@ -169,8 +202,8 @@ def _observations(recording: WandRecording, rows: Index, knot: Index) -> WandObs
     )
 
 
-def group_frames(t_s: Array, camera: Index, spread_s: float) -> Index:
-    """The frame set of each of F frames, (F,); -1 where only one camera has a frame.
+def group_frames(t_s: Array, camera: Index, spread_s: float, least: int = 2) -> Index:
+    """The frame set of each of F frames, (F,); -1 where fewer than `least` cameras have a frame.
 
     A frame set is a run of frames within `spread_s`.
 
@@ -185,11 +218,17 @@ def group_frames(t_s: Array, camera: Index, spread_s: float) -> Index:
             first, current = t, current + 1
         sets[k] = current
     pairs = np.unique(np.column_stack([sets, camera]), axis=0)
-    several = np.bincount(pairs[:, 0], minlength=1) >= 2
+    several = np.bincount(pairs[:, 0], minlength=1) >= least
     return np.where(several, np.cumsum(several) - 1, -1)[sets]
 
 
-def choose_frame_sets(detections: WandDetections, frame_set: Index, sizes: Array, budget: int) -> Mask:
+def choose_frame_sets(
+    detections: WandDetections,
+    frame_set: Index,
+    sizes: Array,
+    budget: int,
+    wanted: Sequence[int] | Index = (),
+) -> Mask:
     """Which of K frame sets to use, at most about `budget`: all, or windows of them that cover all images evenly.
 
     Args:
@@ -197,6 +236,7 @@ def choose_frame_sets(detections: WandDetections, frame_set: Index, sizes: Array
         frame_set: (n,) their frame set.
         sizes: (C, 2) width and height of the cameras' images.
         budget: number of frame sets.
+        wanted: those whose windows are used first, up to half of the budget.
     """
     count = int(frame_set.max(initial=-1)) + 1
     if count <= budget:
@@ -206,7 +246,10 @@ def choose_frame_sets(detections: WandDetections, frame_set: Index, sizes: Array
     cell = (detections.camera * CELLS[0] + column) * CELLS[1] + row
     counts = np.zeros((-(-count // WINDOW), len(sizes) * CELLS[0] * CELLS[1]))
     np.add.at(counts, (frame_set // WINDOW, cell), 1.0)
-    chosen = np.repeat(choose_covering(counts, budget // WINDOW), WINDOW)
+    most = budget // WINDOW
+    first = np.unique(np.array(wanted, np.intp) // WINDOW)
+    first = first[spread_evenly(len(first), most // 2)]
+    chosen = np.repeat(choose_covering(counts, most, first), WINDOW)
     return chosen[:count]
 
 
@@ -302,7 +345,7 @@ def match_points(detections: WandDetections, true_s: Array, gap_s: float) -> Bac
         group for rows in _by_number(detections.label) for group in _match(detections, true_s, rows, gap_s)
     ]
     if len(groups) > MAX_POINTS:
-        groups = [groups[k] for k in np.linspace(0, len(groups) - 1, MAX_POINTS).astype(int)]
+        groups = [groups[k] for k in spread_evenly(len(groups), MAX_POINTS)]
     if not groups:
         return BackgroundPoints.none()
     point = np.repeat(np.arange(len(groups)), [len(group.camera) for group in groups])

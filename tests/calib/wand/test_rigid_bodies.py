@@ -2,22 +2,26 @@
 """Cameras that see different sides of the wand are joined by its pose as a rigid body."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from calib.commands.formats import ImportData
 from calib.rig.camera import transform
-from calib.rig.rig import load_rig
+from calib.rig.rig import Rig, load_rig
 from calib.rig.wand_file import WandBody, load_wand
 from calib.wand.body_poses import BodyLocator, solve_view
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import MarkerTrack
+from calib.wand.initial_rig import TwoViewGeometry, build_initial_rig
+from calib.wand.labels import label_recording
 from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Mask
-from camera_node.geometry.pose import invert, rotation_from_vector
+from camera_node.geometry.pose import Pose, invert, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import read_observations
 from tests.calib.synthetic import CAREFUL, Arena, camera_errors, joint_error, ring, roughly
@@ -85,8 +89,8 @@ def test_eight_cameras_around_a_cube_are_placed_with_an_honest_covariance(sides:
         result = calibrate(rig, CUBE, wave(arena, sides, 60, seed), synchronous=True)
         assert len(result.rig.placed()) == 8
         assert camera_errors(result.rig, arena.truth)[0].max() < 0.02
-        chi2, degrees = joint_error(result, arena.truth)
-        ratios.append(chi2 / degrees)
+        squared, degrees = joint_error(result, arena.truth)
+        ratios.append(squared / degrees)
     assert 0.6 < np.mean(ratios) < 1.6
 
 
@@ -123,6 +127,62 @@ def test_cameras_that_never_saw_the_wand_together_are_named_with_what_would_conn
     assert set(result.report.unplaced) in ({"cam0", "cam1"}, {"cam2", "cam3"})
     for reason in result.report.unplaced.values():
         assert "any side of the wand" in reason
+
+
+def one_after_the_other(groups: Sequence[int], frames: int) -> tuple[Arena, list[Detections]]:
+    """A recording of an arena that is divided along x between groups of cameras: no two groups see the wand at once."""
+    arena = ring(sum(groups), wand=CUBE, speed=3.0)
+    group_of = dict(zip(arena.truth.cameras, np.repeat(np.arange(len(groups)), groups).tolist(), strict=True))
+    edges = np.linspace(-0.5, 0.5, len(groups) + 1)[1:-1]
+    messages = wave(arena, 2, frames, 0, period_ns=33_000_000, phase=0.24)
+    place = {m.t_ns: arena.wand_pose(1e-9 * m.t_ns)[0, 3] for m in messages}
+    return arena, [m for m in messages if group_of[m.camera] == np.searchsorted(edges, place[m.t_ns])]
+
+
+def test_cameras_that_see_the_wand_one_after_the_other_get_an_initial_pose():
+    arena, messages = one_after_the_other((2, 2), 200)
+    recording = label_recording(arena.intrinsics, CUBE, messages)
+    pairs = TwoViewGeometry(recording.detections, recording.lenses, CUBE, recording.timing)
+    start = build_initial_rig(pairs, range(4))
+    assert start.placed == [0, 1, 2, 3]
+    poses = dict(zip(recording.names, (Pose.from_matrix(start.poses[k]) for k in range(4)), strict=True))
+    rough = {n: msgspec.structs.replace(c, T_world_cam=poses[n]) for n, c in arena.truth.cameras.items()}
+    assert camera_errors(Rig(cameras=rough), arena.truth)[0].max() < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("groups", "frames"), [((2, 2), 200), ((2, 1), 300)])
+def test_cameras_that_see_the_wand_one_after_the_other_are_joined_by_its_motion(
+    groups: tuple[int, ...], frames: int
+):
+    """The 99.9 % quantile of chi-square bounds the error of all poses."""
+    arena, messages = one_after_the_other(groups, frames)
+    result = calibrate(roughly(arena.intrinsics, CAREFUL, with_sigma=True), CUBE, messages)
+    assert len(result.rig.placed()) == sum(groups)
+    assert camera_errors(result.rig, arena.truth)[0].max() < 0.03
+    squared, degrees = joint_error(result, arena.truth)
+    assert squared < chi2.ppf(0.999, degrees)
+
+
+def test_the_motion_of_the_wand_gives_its_pose_in_a_frame_next_to_those_of_placed_cameras():
+    """At constant velocity exactly, before the first and after the last frame; not beyond the longest gap."""
+    T_0 = np.eye(4)
+    T_0[:3, :3], T_0[:3, 3] = rotation_from_vector([0.2, -0.5, 0.1]), [0.1, 0.2, 3.0]
+
+    def pose(t_s: float) -> Array:
+        T = T_0.copy()
+        T[:3, :3] = rotation_from_vector([0.0, 0.4 * t_s, 0.3 * t_s]) @ T_0[:3, :3]
+        T[:3, 3] += t_s * np.array([0.5, -0.2, 0.3])
+        return T
+
+    t_s = np.linspace(0.0, 0.2, 5)
+    p = np.array([transform(pose(t), CUBE.points) for t in t_s])
+    tracks = [[MarkerTrack.of(t_s, p[:, k, :2] / p[:, k, 2:]) for k in range(16)]]
+    locator = BodyLocator(tracks, CUBE.points, {0: np.eye(4)}, {0: 0.0}, 0.12)
+    times = locator.handovers(np.array([-0.15, -0.08, -0.04, 0.24, 0.28, 0.4]))
+    assert times.tolist() == [-0.04, 0.24]
+    for t, (found,) in zip(times, locator.locate(times), strict=True):
+        assert found == pytest.approx(pose(t), abs=1e-3)
 
 
 def test_one_view_of_a_plane_leaves_two_poses_and_a_second_camera_decides():
