@@ -44,7 +44,7 @@ from camera_node.foundation.arrays import Array, Index, Mask
 
 INTERRUPTED = 4.0  # sigmas, over all coordinates: something hit the wand, or frames are missing
 MAX_ITERATIONS, MAX_ROUNDS = 60, 5
-MIN_DAMPING, MAX_DAMPING = 1e-9, 1e6
+START_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-5, 1e-9, 1e6  # the first step is damped by a tenth of the start
 # The last step decreases the cost by less than this share, and this absolute amount.
 ROBUST_TOLERANCE, TOLERANCE, ABSOLUTE_TOLERANCE = 5e-3, 1e-4, 1e-4
 # A profiled step that increases the cost by more than MAX_GROWTH is halved.
@@ -61,7 +61,7 @@ GROUP_SIZE = 24  # scalars in one block of the factorization, at least: fewer, l
 def optimize_robustly(problem: Problem, observations: WandObservations, start: State) -> State:
     """Optimize from a rough start with Cauchy's kernel."""
     objective = _Objective(problem, observations, find_weights(problem, observations, start))
-    return _levenberg_marquardt(objective, start, robust=True)[0]
+    return _levenberg_marquardt(objective, start, damping=1e-3, robust=True).state
 
 
 def adjust(
@@ -135,8 +135,9 @@ def _optimize_exactly(
         state = locate_points(problem, state, choice.background)
         found = _profile(objective, state) if profiled else None
         if found is None:
-            state, more = _levenberg_marquardt(objective, state, robust=False)
-            iterations, found = iterations + more, _profile(objective, state)
+            common = _levenberg_marquardt(objective, state)
+            state, iterations = common.state, iterations + common.iterations
+            found = _profile(objective, state)
         profiled, state = found is not None, state if found is None else found
     else:
         weights = find_weights(problem, observations, state)
@@ -206,22 +207,33 @@ class _Step:
     damping: float
 
 
-def _levenberg_marquardt(objective: _Objective, state: State, robust: bool) -> tuple[State, int]:
-    """The optimum, and the number of iterations; where `robust`, Cauchy's scale follows the residuals."""
-    norms, damping = objective.norms(state), 1e-4 if robust else 1e-6
+@dataclass(frozen=True, slots=True)
+class _Minimum:
+    """The optimal state, the number of iterations, and the damping of the last step that was taken."""
+
+    state: State
+    iterations: int
+    damping: float
+
+
+def _levenberg_marquardt(
+    objective: _Objective, state: State, damping: float = START_DAMPING, robust: bool = False
+) -> _Minimum:
+    """The optimum, from the `damping` of the step before. Where `robust`, Cauchy's scale follows the residuals."""
+    norms = objective.norms(state)
     for iteration in range(1, MAX_ITERATIONS + 1):
         if robust:
             scale = CAUCHY_SCALE * max(coordinate_sigma(norms.observation), 1.0)
             objective = replace(objective, observation_scale=scale, interval_scale=CAUCHY_SCALE)
-        before = _Step(state, norms, objective.cost(norms), damping)
+        before = _Step(state, norms, objective.cost(norms), max(damping / 10, MIN_DAMPING))
         step = _descend(objective, before)
         if step is None:
-            return state, iteration
-        state, norms, damping = step.state, step.norms, max(step.damping / 10, MIN_DAMPING)
+            break
+        state, norms, damping = step.state, step.norms, step.damping
         tolerance = ROBUST_TOLERANCE if robust else TOLERANCE
         if before.cost - step.cost < tolerance * before.cost + ABSOLUTE_TOLERANCE:
-            return state, iteration
-    return state, MAX_ITERATIONS
+            break
+    return _Minimum(state, iteration, damping)
 
 
 def _profile(objective: _Objective, state: State) -> State | None:
@@ -229,17 +241,19 @@ def _profile(objective: _Objective, state: State) -> State | None:
     Gauss-Newton; None where it does not converge.
 
     Derivatives along the optimal motion hold only there. From a motion that lags behind its cameras, steps overshoot
-    and alternate, so the motion is optimized before each. Steps end where those that remain, a geometric series of r
+    and alternate, so the motion is optimized before each. It follows the cameras as damped as it was optimized: a knot
+    that the observations hardly determine would move by metres, and all that is gained would be lost. Steps end where those that remain, a geometric series of r
     standard deviations together, add less to the squared error than anyone knows of it: n residuals give a variance to
     (2 / n)^1/2 of itself.
     """
     path = replace(objective, problem=replace(objective.problem, estimated=()))
-    most, before = len(objective.observations) ** -0.25, 1.0  # an observation has two residuals
+    most, before, damping = len(objective.observations) ** -0.25, 1.0, START_DAMPING  # two residuals each
     for _ in range(MAX_ITERATIONS):
         try:
-            state, _ = _levenberg_marquardt(path, state, robust=False)
-            norms = objective.norms(state)
-            steps = profile_motion(objective.linearize(state, norms)).step(objective.problem, state)
+            along = _levenberg_marquardt(path, state, damping)
+            state, damping, norms = along.state, along.damping, objective.norms(along.state)
+            profiled = profile_motion(objective.linearize(state, norms))
+            steps = profiled.step(objective.problem, state, damping)
         except np.linalg.LinAlgError:
             return None
         stepped = _step_profiled(objective, state, norms, steps[:2])
@@ -294,21 +308,20 @@ class ProfiledMotion:
         information: (S d, S d) on the free parameters of the S estimated cameras, with their priors.
         scores: (L + J, S d) gradients by interval between knots, then by background point, without the cameras' priors.
         gradient: (S d,) their sum, with the cameras' priors.
-        response: (K, h, S d) minus the derivative of the optimal motion by the cameras.
-        motion_step: (K, h) from the motion to the optimal one, with the cameras as they are.
+        sums: the equations before the motion was replaced.
     """
 
     information: Array
     scores: Array
     gradient: Array
-    response: Array
-    motion_step: Array
+    sums: "_Sums"
 
-    def step(self, problem: Problem, state: State) -> tuple[Array, Array, float]:
-        """The Gauss-Newton step, (C, 18) of the cameras and (K, h) of the motion, and how far it is: its
-        Mahalanobis length in the cameras."""
+    def step(self, problem: Problem, state: State, damping: float) -> tuple[Array, Array, float]:
+        """The Gauss-Newton step, (C, 18) of the cameras and (K, h) of the motion, which is damped, and how far it is:
+        its Mahalanobis length in the cameras."""
         of_cameras = invert_information(problem, state, self.information) @ self.gradient
-        motion_step = self.motion_step - self.response @ of_cameras
+        right = self.sums.gradient - self.sums.crossed @ of_cameras
+        motion_step = self.sums.motion.damp(damping).factorize().solve(right[:, :, None])[:, :, 0]
         return (
             _all_parameters(problem, of_cameras),
             motion_step,
@@ -327,10 +340,7 @@ def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
     """
     sums = _Sums.of(system)
     (knots, h), size = sums.gradient.shape, len(sums.of_cameras)
-    diagonal = np.einsum("kii->ki", sums.motion.diagonal)
-    best = diagonal.reshape(knots, 2, -1).max(axis=2)
-    least = MIN_RELATIVE_INFORMATION * np.repeat(best, h // 2, axis=1)
-    motion = sums.motion.add_diagonal(damping * diagonal + least).factorize()
+    motion = sums.motion.damp(damping).factorize()
     right = np.concatenate([sums.crossed, sums.gradient[:, :, None]], axis=2)
     response, motion_step = np.split(motion.solve(right), [size], axis=2)
     crossed = sums.crossed.reshape(knots * h, size)
@@ -394,8 +404,8 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     observed = np.zeros((knots, h))
     observed[:-1] += sums.observed[:, :h]
     observed[1:] += sums.observed[:, h:]
-    right = np.concatenate([sums.crossed, observed[:, :, None], sums.gradient[:, :, None]], axis=2)
-    G, again, motion_step = np.split(motion.solve(right), [size, size + 1], axis=2)
+    right = np.concatenate([sums.crossed, observed[:, :, None]], axis=2)
+    G, again = np.split(motion.solve(right), [size], axis=2)
     by_prior = BlockTridiagonal.of_chain(prior).multiply(G)
     along, twice = (sums.crossed + by_prior).reshape(-1, size), motion.solve(by_prior).reshape(-1, size)
     # By interval: the prior of each moves the paths of both its knots.
@@ -408,8 +418,7 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
         information=information + by_priors,
         scores=scores,
         gradient=scores.sum(axis=0) + gradient,
-        response=G,
-        motion_step=motion_step[:, :, 0],
+        sums=sums,
     )
 
 
@@ -433,9 +442,13 @@ class BlockTridiagonal:
         diagonal[1:] += parts[:, h:, h:]
         return cls(diagonal, parts[:, h:, :h])
 
-    def add_diagonal(self, added: Array) -> "BlockTridiagonal":
-        """The matrix with `added` (K, h) on its diagonal."""
-        return BlockTridiagonal(self.diagonal + added[:, :, None] * np.eye(added.shape[1]), self.below)
+    def damp(self, damping: float) -> "BlockTridiagonal":
+        """The matrix with its diagonal multiplied by 1 + `damping`, and the least information added."""
+        knots, h = self.diagonal.shape[:2]
+        diagonal = np.einsum("kii->ki", self.diagonal)
+        best = diagonal.reshape(knots, 2, -1).max(axis=2)
+        added = damping * diagonal + MIN_RELATIVE_INFORMATION * np.repeat(best, h // 2, axis=1)
+        return BlockTridiagonal(self.diagonal + added[:, :, None] * np.eye(h), self.below)
 
     def multiply(self, columns: Array) -> Array:
         """The product with columns (K, h, n), of the same shape."""
