@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Draws a view in a thread, and opens its page in Chromium."""
+"""Draws a view in a thread, and opens its page in Chromium, of which one process serves all tests: its start, and the
+compilation of the page's shaders, are most of the work of a test."""
 
-import ctypes
+import functools
 import shutil
+import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
 from tests.conftest import free_port
-from tests.waiting import DEADLINE_S
+from tests.processes import killed_at_end
+from tests.waiting import DEADLINE_S, wait_for
 from web.page_access import PageAccess
 from web.state.feed import Feed
 from web.view import PanelSection, View
@@ -29,8 +34,21 @@ FLAGS = [
     "--disable-sync",
     "--disable-component-update",
     "--no-first-run",
+    "--headless",
+    "--remote-debugging-port=0",
 ]
-PR_CAPBSET_DROP, CAP_SYS_NICE = 24, 23  # <linux/prctl.h>, <linux/capability.h>
+# Chromium ends with the tests, and may not raise its priority, as it does where it runs as root: it draws without a
+# graphics card, and all other programs would wait for it. PR_SET_PDEATHSIG and PR_CAPBSET_DROP of CAP_SYS_NICE, which
+# is refused to users, who can't raise it.
+START = """
+import ctypes, os, signal, sys
+if sys.platform == "linux":
+    prctl = ctypes.CDLL(None).prctl
+    prctl(1, signal.SIGKILL, 0, 0, 0)
+    prctl(24, 23, 0, 0, 0)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+_until_the_end = ExitStack()
 
 
 def loopback() -> PageAccess:
@@ -72,13 +90,21 @@ def value_of(view: View, label: str) -> Any:
     return next(handle.value for handle in handles if getattr(handle, "label", None) == label)
 
 
-def _give_up_priority() -> None:
-    """Let no program that this thread starts raise its priority, as Chromium does where it runs as root.
+@functools.cache
+def _start_chromium(program: str) -> str:
+    """The address at which the running Chromium is controlled."""
+    folder = tempfile.TemporaryDirectory(prefix="roundel-chromium-", ignore_cleanup_errors=True)
+    profile = Path(_until_the_end.enter_context(folder))
+    command = [sys.executable, "-c", START, program, *FLAGS, f"--user-data-dir={profile}"]
+    _until_the_end.enter_context(killed_at_end(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+    written = profile / "DevToolsActivePort"
+    port, _ = wait_for(lambda: written.exists() and written.read_text().splitlines())
+    return f"http://127.0.0.1:{port}"
 
-    It draws without a graphics card, and all other programs would wait for it.
-    """
-    if sys.platform == "linux":  # refused to users, who can't raise it
-        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_SYS_NICE, 0, 0, 0)
+
+def end_chromium() -> None:
+    """At the end of all tests."""
+    _until_the_end.close()
 
 
 @contextmanager
@@ -92,9 +118,9 @@ def browsing(view: View, url: str = "") -> Iterator[Page]:
         if message.type == "error":
             errors.append(message.text)
 
-    _give_up_priority()
+    address = _start_chromium(CHROMIUM)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        browser = playwright.chromium.connect_over_cdp(address)
         page = browser.new_page(viewport={"width": 1000, "height": 700})
         page.set_default_timeout(1e3 * DEADLINE_S)
         page.on("console", record)

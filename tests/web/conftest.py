@@ -9,11 +9,18 @@ import pytest
 from camera_node.protocol.server_connection import ServerConnection
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from tests.web.browser import drawing, loopback
+from tests.web.browser import drawing, end_chromium, loopback
 from web.page import add_live_page
 from web.state.feed import Feed
 from web.state.subscription import Subscription
 from web.view import View
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_chromium() -> Iterator[None]:
+    """Ends the browser that the first test of the page started."""
+    yield
+    end_chromium()
 
 
 @pytest.fixture

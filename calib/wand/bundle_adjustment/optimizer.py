@@ -220,8 +220,9 @@ def _levenberg_marquardt(
     objective: _Objective, state: State, damping: float = START_DAMPING, robust: bool = False
 ) -> _Minimum:
     """The optimum, from the `damping` of the step before. Where `robust`, Cauchy's scale follows the residuals."""
-    norms = objective.norms(state)
-    for iteration in range(1, MAX_ITERATIONS + 1):
+    norms, iterations = objective.norms(state), 0
+    while iterations < MAX_ITERATIONS:
+        iterations += 1
         if robust:
             scale = CAUCHY_SCALE * max(coordinate_sigma(norms.observation), 1.0)
             objective = replace(objective, observation_scale=scale, interval_scale=CAUCHY_SCALE)
@@ -233,7 +234,7 @@ def _levenberg_marquardt(
         tolerance = ROBUST_TOLERANCE if robust else TOLERANCE
         if before.cost - step.cost < tolerance * before.cost + ABSOLUTE_TOLERANCE:
             break
-    return _Minimum(state, iteration, damping)
+    return _Minimum(state, iterations, damping)
 
 
 def _profile(objective: _Objective, state: State) -> State | None:
@@ -242,9 +243,9 @@ def _profile(objective: _Objective, state: State) -> State | None:
 
     Derivatives along the optimal motion hold only there. From a motion that lags behind its cameras, steps overshoot
     and alternate, so the motion is optimized before each. It follows the cameras as damped as it was optimized: a knot
-    that the observations hardly determine would move by metres, and all that is gained would be lost. Steps end where those that remain, a geometric series of r
-    standard deviations together, add less to the squared error than anyone knows of it: n residuals give a variance to
-    (2 / n)^1/2 of itself.
+    that the observations hardly determine would move by metres, and all steps would be cut for it. Steps end where
+    those that remain, a geometric series of r standard deviations together, add less to the squared error than anyone
+    knows of it: n residuals give a variance to (2 / n)^1/2 of itself.
     """
     path = replace(objective, problem=replace(objective.problem, estimated=()))
     most, before, damping = len(objective.observations) ** -0.25, 1.0, START_DAMPING  # two residuals each
