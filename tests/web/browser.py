@@ -26,8 +26,7 @@ from web.view import PanelSection, View
 Panel = TypeVar("Panel", bound=PanelSection)
 CHROMIUM = shutil.which("chromium")
 FLAGS = [
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
+    "--disable-gpu",  # what is drawn by WebGL is drawn in software; all else without its detour
     "--enable-unsafe-swiftshader",
     "--no-sandbox",
     "--disable-background-networking",
