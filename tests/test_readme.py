@@ -158,7 +158,11 @@ def test_lenses_and_world(folder: Path):
 
 @pytest.mark.computed
 def test_a_recording_from_frames_to_poses(folder: Path):
-    """A shorter recording of the simulator; the resulting poses contain all three robots."""
+    """A shorter recording of the simulator at half the frame rate; the poses contain all three robots."""
+    scene = folder / "configs" / "demo" / "scene.yaml"
+    text, count = re.subn(r"fps: ([0-9.]+)", lambda rate: f"fps: {float(rate[1]) / 2}", scene.read_text())
+    assert count == 4
+    scene.write_text(text)
     shorter = {"--seconds 15": "--seconds 8", "--seconds 5": "--seconds 1"}
     for command in page("offline.md"):
         for long, short in shorter.items():
@@ -254,7 +258,7 @@ def run_demo_with_clients(folder: Path, scene: Path) -> tuple[int, str, str]:
     (code,) = PYTHON.findall(README)
     code = code.replace("tcp/localhost:7447", endpoint).replace('arena="arena"', 'arena="demo"')
     (folder / "follow.py").write_text(code)
-    command = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "12"]
+    command = [sys.executable, "-m", "web", "--demo", "--headless", "--seconds", "8"]
     ros2 = words(f"roundel ros2 --connect {endpoint} --arena demo")
     with contextlib.ExitStack() as stack:
 
