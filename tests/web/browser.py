@@ -97,8 +97,8 @@ def _start_chromium(program: str) -> str:
     command = [sys.executable, "-c", START, program, *FLAGS, f"--user-data-dir={profile}"]
     _until_the_end.enter_context(killed_at_end(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
     written = profile / "DevToolsActivePort"
-    port, _ = wait_for(lambda: written.exists() and written.read_text().splitlines())
-    return f"http://127.0.0.1:{port}"
+    wait_for(lambda: written.exists() and written.read_text().count("\n"))
+    return f"http://127.0.0.1:{written.read_text().splitlines()[0]}"
 
 
 def end_chromium() -> None:
