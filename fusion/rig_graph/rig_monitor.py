@@ -261,8 +261,9 @@ class RigMonitor:
     def _note_clocks(self, verdict: Verdict, measured: Measured | None) -> None:
         """Add a window that contradicts no pose and no lens to what is known of the clocks.
 
-        A jump of a clock is accepted once several verdicts in a row agree on it: a robot's own motion may look like
-        one.
+        While cameras contradict each other, a window contradicts nothing because their errors count as large: poses
+        that drift would look like clocks. A jump of a clock is accepted once several verdicts in a row agree on it: a
+        robot's own motion may look like one.
         """
         self._clocks = [*self._clocks, *verdict.cameras] if verdict.cause == "clock" else []
         if len(set(self._clocks)) > 1:
@@ -270,7 +271,7 @@ class RigMonitor:
         k = verdict.cameras[0] if verdict.cause == "clock" else -1
         if k >= 0 and len(self._clocks) >= CONFIRMED:
             self._walk.jump(k, abs(float(verdict.fit.errors[k, CAUSES["clock"]][0])))
-        elif verdict.cameras or self.excluded:
+        elif verdict.cameras or self.excluded or self.contradicting:
             return
         if measured is None:
             return
@@ -373,9 +374,10 @@ def _measure(
 ) -> Measured | None:
     times = np.array([keyframe.t_ns for keyframe in keyframes])
     is_new = times > since_ns
-    if not is_new.any():
+    shown = window.select(is_new)
+    if not len(shown.camera):
         return None
-    return int(times[is_new].mean()), *fit(window.select(is_new), verdict.fit.hypothesis).equations
+    return int(times[is_new].mean()), *fit(shown, verdict.fit.hypothesis).equations
 
 
 def next_scales(accepted: float, claimed: float, verdict: Verdict, is_confirmed: bool) -> tuple[float, float]:

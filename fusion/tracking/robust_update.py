@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from fusion import _core
 from fusion.model.observations import (
     Assignments,
     DetectionTable,
@@ -100,7 +101,8 @@ class RobustUpdate:
     ) -> RobustFit:
         """The updated states, and the assignments that fit."""
         fitted = self._fit(prediction, detections, assignments)
-        self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
+        if self.added_px2:
+            self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
         if (again := self._left_out_again(fitted, assignments)) is not None:
             fitted = again
         elif not self._is_unusual(fitted):
@@ -129,8 +131,10 @@ class RobustUpdate:
         added_px2: float = 0.0,
     ) -> RobustFit:
         """The updated states; a robot that its detections contradict stays as predicted and loses them."""
-        noisy = detections.replaced(COV, detections.cov + added_px2 * np.eye(2)[:, :, None])
-        observations = MatchedObservations.of(assignments, noisy if added_px2 else detections, self._markers)
+        noisy = detections
+        if added_px2:
+            noisy = detections.replaced(COV, detections.cov + added_px2 * np.eye(2)[:, :, None])
+        observations = MatchedObservations.of(assignments, noisy, self._markers)
         observations = self._estimator.prepared(prediction.states, observations)
         fitted = self._estimator.fit(prediction, observations)
         states, assignments = fitted.states, assignments.with_residuals(fitted.squared_px)
@@ -280,7 +284,8 @@ def _compatible(A: Array, nu: Array, information: Array) -> Mask:
 def _deviations(A: Array, nu: Array, information: Array) -> Array:
     """(B, N) squared deviations of each observation from the prediction and all others; 0 for rows of zeros."""
     J, shape = A.reshape(len(A), -1, A.shape[-1]), nu.shape
-    CJ = J @ np.linalg.inv(information + J.transpose(0, 2, 1) @ J)
+    inverses = np.linalg.inv if A.shape[-1] > 12 else _core.inverses
+    CJ = J @ inverses(information + J.transpose(0, 2, 1) @ J)
     solution = J.transpose(0, 2, 1) @ nu.reshape(len(A), -1, 1)
     u, v = np.moveaxis(nu - (CJ @ solution).reshape(shape), 2, 0)
     (Bu, Bv), (Au, Av) = np.moveaxis(CJ.reshape(A.shape), 2, 0), np.moveaxis(A, 2, 0)

@@ -14,6 +14,7 @@ from camera_node.geometry.pose import rotation_from_vector
 from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
+from tests.benchmarks.trust import Case, run
 from tests.fusion.moved_camera import MOTIONS, MOVE_S, ROBOTS, black, moved
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena
 from tests.fusion.tracks import errors
@@ -110,3 +111,11 @@ def test_a_process_that_judges_is_started_again_after_it_was_killed():
         with contextlib.suppress(BrokenExecutor):  # unless the end was noticed before the job came
             judge.submit(os.getpid).result(DEADLINE_S)
         assert judge.submit(os.getpid).result(DEADLINE_S) not in {first, os.getpid()}
+
+
+@pytest.mark.slow
+def test_the_clock_of_an_innocent_camera_is_not_blamed_for_a_pose_that_drifts():
+    """It drifts on after its new pose is known; the other cameras' stamps stay as they are."""
+    outcome = run(Case(kind="drifting 0.3 deg in 10 s", cameras=3, seed=0))
+    assert outcome.report == "right", outcome.lines
+    assert outcome.rewritten == []
