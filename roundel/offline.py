@@ -32,7 +32,7 @@ from camera_node.simulation.simulated_camera import render_recording
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import RobotPose, Robots
-from fusion.recordings.arena_recording import ArenaRecording, read_recording
+from fusion.recordings.arena_recording import FRAMES, ArenaRecording, read_recording
 from fusion.recordings.offline_fusion import (
     OfflineArena,
     Summary,
@@ -284,7 +284,7 @@ def _numbered(images: Iterable[Grey]) -> Iterator[tuple[str, Grey]]:
 def _poses(recording: Recording, arena: OfflineArena, is_as_live: bool) -> Iterator[RobotPose]:
     summary, before = Summary(), recording.faults.copy()
     held = read_recording(recording.path) if is_as_live else ArenaRecording()
-    if held.frame_sets:
+    if held.counts[FRAMES]:
         results = fuse_frame_sets(recorded_frame_sets(held, arena.cameras, summary.faults), arena, summary)
     else:
         results = fuse_recording(recording.arrivals(Rig(cameras=arena.cameras)), arena, summary)

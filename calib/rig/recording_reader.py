@@ -178,7 +178,7 @@ class RecordingReader:
         """Yield chunks and other records; damaged ones that follow each other are one part."""
         position, damaged_from, has_end = len(MAGIC), None, False
         while position is not None and position < self._end and not has_end:
-            part = self._read_part(position)
+            part = self.read_part(position)
             if part is None or part.records is None:
                 damaged_from = position if damaged_from is None else damaged_from
                 position = self._find_chunk(damaged_from + 1) if part is None else part.end
@@ -265,7 +265,7 @@ class RecordingReader:
         self._is_behind_damage = True
         return FilePart(start, end, SET_ASIDE, None)
 
-    def _read_part(self, start: int) -> FilePart | None:
+    def read_part(self, start: int) -> FilePart | None:
         """The record at a position; None if none begins there."""
         self.file.seek(start)
         head = self.file.read(RECORD.size)
@@ -346,7 +346,7 @@ class RecordingReader:
             self.file.seek(start)
             block = self.file.read(min(SEARCH_BYTES, self._end - start))
             for found in CHUNK_PATTERN.finditer(block):
-                part = self._read_part(start + found.start())
+                part = self.read_part(start + found.start())
                 if part is not None and part.chunk is not None and part.records:
                     return part.start
             start += max(1, len(block) - RECORD.size - MAX_CHUNK_HEADER)

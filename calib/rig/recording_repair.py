@@ -46,24 +46,15 @@ class Repair:
     faults: Counter[str]
 
 
-@dataclass(frozen=True)
-class _IndexedChunk:
-    """A complete chunk: its entry in the index, its place in the file, and the messages of each channel."""
-
-    index: ChunkIndex
-    part: FilePart
-    counts: Counter[int]
-
-
 @dataclass
 class _Content:
-    """The complete records of a recording."""
+    """The complete records of a recording, which may be larger than the memory."""
 
     reader: RecordingReader
     is_sound: bool = True
     end: int = len(MAGIC)
-    damaged: list[FilePart] = field(default_factory=list)  # not marked yet
-    chunks: list[_IndexedChunk] = field(default_factory=list)
+    unmarked: list[FilePart] = field(default_factory=list)  # damaged parts, and chunks with another opcode
+    chunks: list[ChunkIndex] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)  # messages by channel
 
 
@@ -91,7 +82,8 @@ def repair_recording(path: Path, max_size: int | None = None, limits: ReadLimits
             lost_bytes = size - content.end if reader.is_cut_off else 0
             if not was_complete:
                 _write_index(file, content, max_size)
-            if content.damaged:  # a chunk of which only the length was wrong is readable now
+            if any(part.records is None for part in content.unmarked):
+                # A chunk of which only the length was wrong is readable now.
                 reader = RecordingReader(file, reader.limits)
                 content = _read_content(file, reader)
                 if not content.is_sound:
@@ -111,24 +103,22 @@ def _read_content(file: IO[bytes], reader: RecordingReader) -> _Content:
     for part in reader.parts():
         if part.records is None:
             file.seek(part.start)
-            is_marked = file.read(RECORD.size) == _mark(part)
-            if not is_marked:
-                content.is_sound = False
-                content.damaged.append(part)
+            if file.read(RECORD.size) != _mark(part):
+                content.unmarked.append(part)
         else:
-            times, counts = [], Counter[int]()
+            times = []
             for message in reader.messages(part):
-                counts[message.channel] += 1
+                content.counts[message.channel] += 1
                 times = (
                     [min(message.t_ns, *times), max(message.t_ns, *times)] if times else [message.t_ns] * 2
                 )
-            content.counts += counts
             if part.chunk is not None:
-                content.is_sound &= part.opcode == Opcode.CHUNK
-                place = part._replace(records=b"")  # a recording may be larger than the memory
-                content.chunks.append(_IndexedChunk(_chunk_index(part, times), place, counts))
+                content.chunks.append(_chunk_index(part, times))
+                if part.opcode != Opcode.CHUNK:
+                    content.unmarked.append(part._replace(records=b""))
         if part.opcode != Opcode.DATA_END:
             content.end = part.end
+    content.is_sound &= not content.unmarked
     return content
 
 
@@ -155,10 +145,10 @@ def _chunk_index(part: FilePart, times: list[int]) -> ChunkIndex:
 
 def _write_index(file: IO[bytes], content: _Content, max_size: int | None) -> None:
     while content.chunks and max_size is not None and content.end + len(_index(content)) > max_size:
-        removed = content.chunks.pop()
-        content.counts -= removed.counts
-        content.end = removed.part.start
-    for part in (*content.damaged, *(chunk.part for chunk in content.chunks)):
+        content.end = content.chunks.pop().chunk_start_offset
+        if (removed := content.reader.read_part(content.end)) is not None:
+            content.counts -= Counter(message.channel for message in content.reader.messages(removed))
+    for part in content.unmarked:
         if part.start < content.end:
             file.seek(part.start)
             file.write(_mark(part))
@@ -172,13 +162,14 @@ def _index(content: _Content) -> bytes:
     """The bytes behind the last chunk: the end of the data, the summary and the footer."""
     reader = content.reader
     data_end = encode_records([] if reader.has_header else [HEADER], [DataEnd(data_section_crc=0)])
-    chunks = [chunk.index for chunk in content.chunks]
     definitions = [
         RECORD.pack(opcode, len(record)) + record
         for opcode, known in ((Opcode.SCHEMA, reader.schemas), (Opcode.CHANNEL, reader.channels))
         for record in known.values()
     ]
-    summary = b"".join(definitions) + encode_records([_statistics(content)] if chunks else [], chunks)
+    summary = b"".join(definitions) + encode_records(
+        [_statistics(content)] if content.chunks else [], content.chunks
+    )
     start = content.end + len(data_end) if summary else 0
     # the checksum covers the summary and the footer up to the checksum itself
     unsigned = encode_records([Footer(summary_start=start, summary_offset_start=0, summary_crc=0)])
@@ -188,8 +179,8 @@ def _index(content: _Content) -> bytes:
 
 
 def _statistics(content: _Content) -> Statistics:
-    times = [chunk.index for chunk in content.chunks if chunk.counts]
-    starts, ends = [i.message_start_time for i in times], [i.message_end_time for i in times]
+    times = [chunk for chunk in content.chunks if chunk.message_end_time]  # others only define channels
+    starts, ends = [chunk.message_start_time for chunk in times], [chunk.message_end_time for chunk in times]
     if content.reader.statistics is not None:  # the recorder's: they include damaged parts at both ends
         starts.append(content.reader.statistics.start_ns)
         ends.append(content.reader.statistics.end_ns)

@@ -20,7 +20,7 @@ from fusion.export.pose_formats import (
     write_tum,
 )
 from fusion.export.recorded_poses import RecordedPoses
-from fusion.recordings.arena_recording import read_recording
+from fusion.recordings.arena_recording import DETECTIONS, read_recording
 from fusion.recordings.recording_files import say_skipped
 
 WRITERS = {
@@ -63,9 +63,9 @@ def export(
         raise ConfigError(f"{out} exists; give another name, or --force to replace it")
     if chosen == "observations":
         recorded = read_recording(recording)
-        write_observations(out, (message for _, message in recorded.detections))
+        write_observations(out, (message for _, message in recorded.messages(DETECTIONS)))
         say_skipped(recorded.faults)
-        say(f"wrote {out}: {len(recorded.detections)} frames")
+        say(f"wrote {out}: {recorded.counts[DETECTIONS]} frames")
         return 0
     poses = RecordedPoses(recording, robots)
     files = _write(chosen, poses, out, rate_hz)

@@ -13,10 +13,10 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import zenoh
 
@@ -45,36 +45,8 @@ PICTURE_S = 1.0  # between two pictures of a public recording
 ANSWER_S = 10.0
 NO_ROBOTS = "no robot is declared: a replay of this recording needs --robots robots.yaml"
 DETECTIONS, POSE, FRAMES = "/detections", "/pose", "/fusion/frames"  # the ends of keys
-INSTALLATION, SNAPSHOT = "/recording", "/snapshot"
+INSTALLATION = "/recording"
 KINDS = {DETECTIONS: Detections, POSE: RobotPose, FRAMES: FusedFrames}
-T = TypeVar("T")
-
-
-class RecordedMessages(Generic[T]):
-    """Messages of one kind in a recording: each iteration reads the file, which may be larger than the memory.
-
-    Args:
-        path: of the file; None holds no messages.
-        suffix: of their keys.
-        kind: of the messages.
-        count: how many can be decoded.
-        convert: makes an item of the time of arrival (ns) and the message.
-    """
-
-    def __init__(
-        self, path: Path | None, suffix: str, kind: type, count: int, convert: Callable[[int, Any], T]
-    ) -> None:
-        self._path, self._suffix, self._kind, self._count = path, suffix, kind, count
-        self._convert = convert
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __iter__(self) -> Iterator[T]:
-        for key, data, received_ns in read_messages(self._path, Counter()) if self._path else ():
-            if key.endswith(self._suffix):
-                with contextlib.suppress(MessageError):  # counted when the recording was read first
-                    yield self._convert(received_ns, decode(data, self._kind))
 
 
 @dataclass
@@ -91,34 +63,15 @@ class ArenaRecording:
         default_factory=Counter
     )  # messages that can be decoded, by the end of their keys
 
-    @property
-    def detections(self) -> RecordedMessages[tuple[int, Detections]]:
-        """When each message of a camera arrived (ns), and the message, in order of arrival."""
-        n = self.counts[DETECTIONS]
-        return RecordedMessages(self.path, DETECTIONS, Detections, n, lambda t_ns, message: (t_ns, message))
+    def messages(self, *suffixes: str) -> Iterator[tuple[int, Any]]:
+        """When each message on keys with these ends of `KINDS` arrived (ns), and the message, in the file's order.
 
-    @property
-    def poses(self) -> RecordedMessages[RobotPose]:
-        """The poses that the server published."""
-        return RecordedMessages(self.path, POSE, RobotPose, self.counts[POSE], lambda _, pose: pose)
-
-    @property
-    def frame_sets(self) -> RecordedMessages[FusedFrames]:
-        """The frame sets as the server formed them."""
-        return RecordedMessages(self.path, FRAMES, FusedFrames, self.counts[FRAMES], lambda _, fused: fused)
-
-    def pictures(self) -> Iterator[tuple[str, bytes, int]]:
-        """The pictures of a public recording: camera, JPEG, and time of arrival (ns)."""
+        Each call reads the file, which may be larger than the memory.
+        """
         for key, data, received_ns in read_messages(self.path, Counter()) if self.path else ():
-            if key.endswith(SNAPSHOT):
-                yield key.split("/")[-2], data, received_ns
-
-    def frames_and_sets(self) -> Iterator[tuple[int, Detections | FusedFrames]]:
-        """Messages of cameras and frame sets, each with its arrival (ns), in one pass over the file."""
-        for key, data, received_ns in read_messages(self.path, Counter()) if self.path else ():
-            for suffix in (DETECTIONS, FRAMES):
+            for suffix in suffixes:
                 if key.endswith(suffix):
-                    with contextlib.suppress(MessageError):
+                    with contextlib.suppress(MessageError):  # counted when the recording was read first
                         yield received_ns, decode(data, KINDS[suffix])
 
     def add(self, key: str, data: bytes) -> None:
@@ -155,7 +108,7 @@ def read_recording(path: Path) -> ArenaRecording:
     recording = ArenaRecording(path)
     for key, data, _ in read_messages(path, recording.faults):
         recording.add(key, data)
-    if not recording.detections:
+    if not recording.counts[DETECTIONS]:
         raise ConfigError(f"{path} holds no detections; record with roundel record {path}")
     return recording
 

@@ -26,7 +26,7 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusedFrames
-from fusion.recordings.arena_recording import DETECTIONS, ArenaRecording, skipped
+from fusion.recordings.arena_recording import DETECTIONS, FRAMES, ArenaRecording, skipped
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Refusal, admit
 from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult
@@ -141,8 +141,8 @@ def fuse_again(
 ) -> Iterator[TrackingResult]:
     """Fuse a recording: the server's frame sets, or, with `forms_sets` or if it holds none, those that its
     detections form by their times of arrival."""
-    if forms_sets or not recording.frame_sets:
-        return fuse_recording(recording.detections, arena, summary)
+    if forms_sets or not recording.counts[FRAMES]:
+        return fuse_recording(recording.messages(DETECTIONS), arena, summary)
     return fuse_frame_sets(recorded_frame_sets(recording, arena.cameras, summary.faults), arena, summary)
 
 
@@ -246,7 +246,7 @@ def _with_their_frames(recording: ArenaRecording) -> Iterator[tuple[FusedFrames,
     sets = deque[tuple[int, FusedFrames]]()
     held: Held = {}
     arrivals = deque[tuple[int, tuple[str, int]]]()
-    for received_ns, message in recording.frames_and_sets():
+    for received_ns, message in recording.messages(DETECTIONS, FRAMES):
         if isinstance(message, FusedFrames):
             sets.append((received_ns, message))
         elif (key := (message.camera, message.t_ns)) not in held:  # the server refuses duplicates, too

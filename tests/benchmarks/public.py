@@ -13,6 +13,7 @@ import re
 import shlex
 import subprocess
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -23,11 +24,12 @@ import numpy as np
 import tyro
 from rich.table import Table
 
+from calib.rig.recording import read_messages
 from calib.rig.rig import Rig, load_rig
 from camera_node.foundation.terminal import console, say
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import read_observations
-from fusion.recordings.arena_recording import ArenaRecording, read_recording
+from fusion.recordings.arena_recording import POSE, read_recording
 from roundel import Detector, track
 from tests.benchmarks.calibration_data import gather_points, residuals_px, tracks_of_messages
 from tests.benchmarks.calibration_recordings import DATA, board_corners, corner_errors
@@ -158,14 +160,16 @@ def tabulate_sets() -> Table:
 def tabulate_recording(path: Path) -> Table:
     """A row for each robot of a recording: tracked share of the estimated poses, and distance from the published."""
     recording = read_recording(path)
-    published = {(pose.robot, pose.t_ns): pose.position for pose in recording.poses if pose.state != "lost"}
+    published = {
+        (pose.robot, pose.t_ns): pose.position for _, pose in recording.messages(POSE) if pose.state != "lost"
+    }
     rows: dict[str, list[tuple[bool, float, float]]] = {}
     for pose in track(path, recording.rig, recording.robots):
         before = published.get((pose.robot, pose.t_ns))
         off = np.nan if before is None else float(np.linalg.norm(np.subtract(pose.position, before)))
         residual = np.nan if pose.residual_px is None else pose.residual_px
         rows.setdefault(pose.robot, []).append((pose.state == "tracked", off, residual))
-    title = f"{path.name}: {describe_pictures(recording)}"
+    title = f"{path.name}: {describe_pictures(path)}"
     table = Table("robot", "poses", "tracked", "from the published, mm RMS", "residual, px RMS", title=title)
     for robot, values in sorted(rows.items()):
         tracked, off, residual = np.array(values, float).T
@@ -174,13 +178,14 @@ def tabulate_recording(path: Path) -> Table:
     return table
 
 
-def describe_pictures(recording: ArenaRecording) -> str:
+def describe_pictures(path: Path) -> str:
     """What the recording was made with, and the mean number of roundels in its pictures."""
-    made = recording.installation
+    made = read_recording(path).installation
     versions = "not a public recording" if made is None else f"Roundel {made.packages.get('roundel', '?')}"
     pictures = [
         cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-        for _, data, _ in recording.pictures()
+        for key, data, _ in read_messages(path, Counter())
+        if key.endswith("/snapshot")
     ]
     found = [len(Detector().detect(picture.astype(np.uint8))) for picture in pictures if picture is not None]
     return f"{versions}, {len(found)} pictures with {np.mean(found or [0]):.1f} roundels"

@@ -15,7 +15,7 @@ import pytest
 from calib.rig.recording import RecordingWriter, read_messages
 from camera_node.foundation.errors import ConfigError
 from fusion.export.pose_formats import COLUMNS
-from fusion.recordings.arena_recording import read_recording
+from fusion.recordings.arena_recording import DETECTIONS, POSE, read_recording
 from roundel import Recording
 from tests.conftest import ROOT
 
@@ -25,8 +25,8 @@ WAND = ROOT / "tests" / "data" / "wand"
 
 def test_all_of_a_recording():
     recording, held = Recording(SAMPLE), read_recording(SAMPLE)
-    assert list(recording.detections()) == [message for _, message in held.detections]
-    assert list(recording.poses()) == list(held.poses)
+    assert list(recording.detections()) == [message for _, message in held.messages(DETECTIONS)]
+    assert list(recording.poses()) == [pose for _, pose in held.messages(POSE)]
     assert recording.rig == held.rig
     assert recording.robots is not None
     assert recording.robots.robots == held.robots

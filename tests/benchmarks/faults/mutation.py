@@ -37,6 +37,7 @@ BYTES = (
     bytes(4096),
 )
 NESTED = (100, 1000, 50_000)  # depths
+LARGEST = 1 << 24  # bytes of a column: mutations of mutations took all memory
 
 
 def mutate(message: Any, rng: random.Random) -> bytes:
@@ -100,7 +101,8 @@ def damaged_value(value: Any, rng: random.Random) -> Any:
 def damaged_bytes(value: bytes, rng: random.Random) -> bytes:
     """A column of the wrong size, or with numbers that are not finite or not plausible."""
     if not value or rng.random() < 0.3:
-        return rng.choice((*BYTES, value[:-1], value + value, value * 100))
+        longer = value * min(100, 1 + LARGEST // len(value)) if value else b""
+        return rng.choice((*BYTES, value[:-1], value + value, longer))
     size = rng.choice((4, 8))
     number = struct.pack(
         "<f" if size == 4 else "<d", rng.choice((math.nan, math.inf, -1e30, 0.0, 1e-30, 3e38))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from calib.rig.recording import RecordingWriter
+from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
@@ -22,7 +22,7 @@ from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.commands.trim import trim
 from fusion.protocol.pose_messages import Robots
-from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder, read_recording
+from fusion.recordings.arena_recording import DETECTIONS, NO_ROBOTS, POSE, ArenaRecorder, read_recording
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
 from fusion.tracking.smoothing import Smoother
@@ -63,7 +63,8 @@ def test_a_replay_repeats_the_poses(tmp_path):
     assert len(expected) > 10
     for source, out in (("in.mcap", "once.mcap"), ("once.mcap", "twice.mcap")):
         assert replay(tmp_path / source, out=tmp_path / out) == 0
-        assert list(map(encode, read_recording(tmp_path / out).poses)) == list(map(encode, expected))
+        poses = [encode(pose) for _, pose in read_recording(tmp_path / out).messages(POSE)]
+        assert poses == list(map(encode, expected))
     replay(tmp_path / "in.mcap", out=tmp_path / "poses.csv")
     with (tmp_path / "poses.csv").open() as file:
         assert [int(row["t_ns"]) for row in csv.DictReader(file)] == [pose.t_ns for pose in expected]
@@ -106,7 +107,7 @@ def test_a_truncated_recording_is_read_up_to_its_end(tmp_path):
     (tmp_path / "half.mcap").write_bytes(data[: len(data) * 9 // 10])
     whole, part = (read_recording(tmp_path / f"{name}.mcap") for name in ("whole", "half"))
     assert part.robots == whole.robots == MOVING.robots
-    assert 0 < len(part.detections) <= len(whole.detections)
+    assert 0 < part.counts[DETECTIONS] <= whole.counts[DETECTIONS]
     assert sum(part.faults.values()) == 1
 
 
@@ -129,7 +130,7 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
             connection = Connection(connect=server.endpoints, arena="test")
             record(tmp_path / "live.mcap", connection=connection, seconds=4.0)
     recording = read_recording(tmp_path / "live.mcap")
-    assert {message.camera for _, message in recording.detections} == ARENA.cameras.keys()
+    assert {message.camera for _, message in recording.messages(DETECTIONS)} == ARENA.cameras.keys()
     assert recording.rig is not None
     assert recording.rig.cameras == ARENA.cameras
     assert recording.robots == server.pipeline.robots
@@ -159,11 +160,11 @@ def test_a_public_recording_has_pictures_and_versions(tmp_path):
             thread.join(DEADLINE_S)
         camera.undeclare()
     assert trim(path, part, from_s=0.5) == 0
-    for recording in map(read_recording, (path, part)):
+    for file in (path, part):
+        recording = read_recording(file)
         assert recording.installation is not None
         assert recording.installation.packages["roundel"] == version("roundel")
-        pictures = list(recording.pictures())
-        assert {picture[:2] for picture in pictures} == {("cam0", jpeg)}
+        assert {data for key, data, _ in read_messages(file) if key == KEYS.snapshot("cam0")} == {jpeg}
         assert not recording.faults
 
 
