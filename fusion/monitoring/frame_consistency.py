@@ -14,8 +14,8 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.expected_views import ExpectedViews
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.model.states import States
+from fusion.monitoring.residual_monitor import LEARNED
 
-LEARNED = 15  # frames that define the usual number of assigned detections of a camera
 MIN_USUAL = 8.0  # assigned detections, from which a frame is judged
 FALLEN, AGREEING = 0.6, 0.8  # shares of the usual number: below, a frame is suspicious; above, it agrees
 MIN_DETECTED = 0.6  # of the usual number: a camera that sees little contradicts nothing

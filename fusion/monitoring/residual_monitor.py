@@ -17,7 +17,7 @@ from fusion._core import SLACK_PX
 MIN_RESIDUALS = 12  # in a frame set
 MIN_RATIO = 2.0  # of an unusual residual to the usual one
 SLACK_RATIO = 3.0  # of the largest calibration errors to the usual residual
-LEARNED = 15  # frame sets that define what is usual
+LEARNED = 15  # frame sets that define what is usual, also of a camera
 REJOINED = 0.01  # probability with which detections that agree are left out once more
 POSE_ERRORS = 6  # of a body, which detections determine first
 FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 frame sets a second

@@ -122,14 +122,8 @@ class ClaimCheck:
         for robot in chosen.tolist():
             mine = np.flatnonzero((owner[rows] == robot) & np.isfinite(nu).all(axis=1))
             camera = detections.camera[assignments.detection[rows[mine]]]
-            information = prediction.information[robot]
-            self._sample(
-                robot,
-                camera,
-                _Equations(A[mine], nu[mine], metres[mine], rig[mine]),
-                information,
-                moved[robot],
-            )
+            equations = _Equations(A[mine], nu[mine], metres[mine], rig[mine])
+            self._sample(robot, camera, equations, prediction.information[robot], moved[robot])
 
     def _sample(
         self, robot: int, camera: Index, equations: "_Equations", information: Array, moved: Array
@@ -157,11 +151,8 @@ class ClaimCheck:
         still = self._without.contradicts() | (self._without.redundancy <= MIN_REDUNDANCY)
         explains = involved & ~still[bad].any(axis=0) & ~(self._left_out[fine].sum(axis=0) > 0)
         if explains.sum() == 1:
-            errors_m2, count = (
-                self._left_out_m2[bad][:, explains].sum(),
-                self._left_out[bad][:, explains].sum(),
-            )
-            return (self._describe("camera", bad, explains, errors_m2 / count),)
+            errors_m2 = self._left_out_m2[bad][:, explains].sum() / self._left_out[bad][:, explains].sum()
+            return (self._describe("camera", bad, explains, errors_m2),)
         if not explains.any() and (fine.any() or bad.sum() == 1):
             rows = np.eye(len(bad), dtype=bool)[bad]
             return tuple(self._describe("robot", row, involved, self._mean_m2(row)) for row in rows)

@@ -51,14 +51,9 @@ class RigResponse:
 
     def update(self, fitted: RobustFit) -> None:
         """Follow a step of the filter, whose added noise the detections of a camera have in common."""
-        prediction, equations = fitted.prediction, (fitted.equations, fitted.weights)
-        self._follow(
-            fitted.states,
-            fitted.observations,
-            equations,
-            (prediction.information, prediction.motion),
-            fitted.added_px2,
-        )
+        equations = fitted.equations, fitted.weights
+        predicted = fitted.prediction.information, fitted.prediction.motion
+        self._follow(fitted.states, fitted.observations, equations, predicted, fitted.added_px2)
 
     def forget(self, rows: Index) -> None:
         """The errors of robots (rows) that start from a state of unknown origin follow none of the cameras."""

@@ -31,6 +31,7 @@ from fusion.model.undistortion import COV
 from fusion.monitoring.residual_monitor import LEARNED, ResidualMonitor, camera_at_fault
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
+from fusion.tracking.rays import GATE
 
 # Squared residual over that of calibration errors, from which a robot's detections are compared.
 SUSPICIOUS = 4.0
@@ -223,9 +224,6 @@ class RobustUpdate:
         return moved & (np.sum((fitted.states.p - states.p) ** 2, 1) > MIN_CORRECTION**2 * variance)
 
 
-MAX_DEVIATION = 13.8  # chi-square with 2 degrees of freedom, one in a thousand, as the gates of association
-
-
 def jointly_compatible(
     estimator: Estimator,
     prediction: Prediction,
@@ -275,7 +273,7 @@ def _compatible(A: Array, nu: Array, information: Array) -> Mask:
         rows = used[bodies][:, :, None]
         deviation = _deviations(A[bodies] * rows[..., None], nu[bodies] * rows, information[bodies])
         worst = np.argmax(deviation, 1)
-        found = deviation[np.arange(len(bodies)), worst] > MAX_DEVIATION
+        found = deviation[np.arange(len(bodies)), worst] > GATE
         bodies, worst = bodies[found], worst[found]
         used[bodies, worst] = False
     return used

@@ -170,15 +170,7 @@ class Tracker:
             self.geometry.note(summary.mean_px2)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
-        return Update(
-            t_ns,
-            associated.prediction,
-            tracked,
-            detections,
-            assignments,
-            summary,
-            poses,
-        )
+        return Update(t_ns, associated.prediction, tracked, detections, assignments, summary, poses)
 
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
