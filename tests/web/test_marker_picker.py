@@ -132,11 +132,15 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
 
 
 def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicker]):
-    """No marker selected; a marker deselected; one that is not there; another diameter; two markers; a bad name."""
+    """No marker selected, which clicks do only after the button; a marker deselected; one that is not there; another
+    diameter; two markers; a bad name."""
     _, _, picker = arena
     refused(picker, "no marker")
-    picker._toggle()
+    wait_for(lambda: len(picker._unlabeled))
     above = marker_positions()[0] + [0.0, 0.0, 2.0]
+    picker.select(above, (0.0, 0.0, -1.0))
+    assert picker.selected == []
+    picker._toggle()
     wait_for(lambda: picker.selected, lambda: picker.select(above, (0.0, 0.0, -1.0)))
     picker.select(above, (0.0, 0.0, -1.0))
     assert picker.selected == []
@@ -156,10 +160,3 @@ def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicke
 def refused(picker: MarkerPicker, reason: str) -> None:
     with pytest.raises(RoundelError, match=reason):
         picker.define()
-
-
-def test_clicks_select_nothing_before_the_button(arena: tuple[Client, View, MarkerPicker]):
-    _, _, picker = arena
-    wait_for(lambda: len(picker._unlabeled))
-    picker.select(marker_positions()[0] + [0.0, 0.0, 2.0], (0.0, 0.0, -1.0))
-    assert picker.selected == []
