@@ -314,7 +314,7 @@ class RigMonitor:
         pose = Pose.from_matrix(retract(window.T, best.errors)[k])
         stated = tuple(map(tuple, covariance.tolist()))
         camera = msgspec.structs.replace(self._cameras[name], T_world_cam=pose, covariance=stated)
-        joint = best.joint_covariance(self._cameras.covariance, k)
+        joint = best.joint_covariance(window.prior, k)
         rig = with_errors(self._cameras.as_dict() | {name: camera}, joint)
         return ExtrinsicsCorrection(name, rig[name], rig=rig)
 

@@ -9,6 +9,7 @@ from concurrent.futures import BrokenExecutor
 import msgspec
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from camera_node.geometry.pose import rotation_from_vector
 from fusion.rig_graph.rig_monitor import JudgeProcess
@@ -119,3 +120,13 @@ def test_the_clock_of_an_innocent_camera_is_not_blamed_for_a_pose_that_drifts():
     outcome = run(Case(kind="drifting 0.3 deg in 10 s", cameras=3, seed=0))
     assert outcome.report == "right", outcome.lines
     assert outcome.rewritten == []
+
+
+@pytest.mark.slow
+def test_claims_are_as_before_once_the_camera_that_was_moved_has_its_new_pose():
+    """While nothing is decided they count the errors of all cameras as larger; the new rig must not state these."""
+    case = Case(kind="turned 0.1 deg", cameras=3, seed=0)
+    outcome = run(case)
+    assert outcome.report == "right", outcome.lines
+    degrees = 3 * case.robots
+    assert min(outcome.ratios[1:]) > chi2.ppf(1e-3, degrees) / degrees
