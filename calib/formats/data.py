@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the formats of other programs contain: cameras, and points that these cameras saw in numbered frames."""
 
-import csv
-import io
 import os
 import stat
 from collections.abc import Iterable
@@ -18,7 +16,7 @@ from calib.rig.camera import Camera
 from calib.rig.estimation import STEPS
 from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array, Index
-from camera_node.foundation.config import write_atomically
+from camera_node.foundation.config import write_table
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector, skew
@@ -106,19 +104,12 @@ class PointTable:
         Raises:
             ConfigError: the file can't be written.
         """
-        when = (
-            self.frame
-            if self.t_s is None
-            else np.round((self.t_s - min(self.t_s.min(), 0)) * 1e9).astype(np.int64)
-        )
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["frame" if self.t_s is None else "t_ns", "camera", "u", "v", "marker"])
-        for t, camera, (u, v), marker in zip(
-            when.tolist(), self.camera, self.uv, self.marker.tolist(), strict=True
-        ):
-            writer.writerow([t, camera, f"{u:.4f}", f"{v:.4f}", marker])
-        write_atomically(path, text.getvalue())
+        time, when = "frame", self.frame
+        if self.t_s is not None:
+            time, when = "t_ns", np.round((self.t_s - min(self.t_s.min(), 0)) * 1e9).astype(np.int64)
+        u, v = ([f"{pixels:.4f}" for pixels in column] for column in self.uv.T)
+        rows = zip(when.tolist(), self.camera, u, v, self.marker.tolist(), strict=True)
+        write_table(path, f"{time},camera,u,v,marker", rows)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,14 @@ A file is read in bounded time and memory: PyYAML and libyaml recurse, and expan
 """
 
 import contextlib
+import csv
 import difflib
 import os
 import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -211,6 +212,14 @@ def new_path(path: Path, own: Collection[str] = ()) -> Iterator[Path]:
         for name in own:
             (path / name).unlink(missing_ok=True)
         os.replace(folder / path.name, path)
+
+
+def write_table(path: Path, columns: str, rows: Iterable[Iterable[object]]) -> None:
+    """Write a CSV with these columns, separated by commas, as `new_path` does. Raises ConfigError as that does."""
+    with new_path(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns.split(","))
+        writer.writerows(rows)
 
 
 class _Dumper(yaml.SafeDumper):

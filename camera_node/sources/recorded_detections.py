@@ -11,7 +11,7 @@ import numpy as np
 
 from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
-from camera_node.foundation.config import new_path, require_name
+from camera_node.foundation.config import require_name, write_table
 from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.foundation.terminal import track
 from camera_node.protocol.messages import Detections
@@ -127,10 +127,7 @@ def write_observations(path: Path, messages: Iterable[Detections]) -> None:
     Raises:
         ConfigError: the file can't be written.
     """
-    with new_path(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["t_ns", "camera", "u", "v", "marker", "code"])
-        writer.writerows(_flatten(messages))
+    write_table(path, "t_ns,camera,u,v,marker,code", _flatten(messages))
 
 
 def _flatten(messages: Iterable[Detections]) -> Iterator[tuple]:

@@ -2,7 +2,6 @@
 """Writes poses and points in the formats of other programs. Files appear complete or not at all."""
 
 import contextlib
-import csv
 import os
 from collections import Counter
 from collections.abc import Iterable
@@ -12,7 +11,7 @@ from typing import IO, Any, Literal
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.foundation.config import hidden_folder, new_path, write_atomically
+from camera_node.foundation.config import hidden_folder, new_path, write_atomically, write_table
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
 from camera_node.geometry.pose import wxyz_from_rotation
@@ -55,10 +54,7 @@ def write_csv(poses: Iterable[RobotPose], path: Path) -> None:
     Raises:
         ConfigError: the folder can't be written to.
     """
-    with new_path(path) as part, part.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS.split(","))
-        writer.writerows(map(_row, poses))
+    write_table(path, COLUMNS, map(_row, poses))
 
 
 def _row(pose: RobotPose) -> list:
