@@ -61,7 +61,7 @@ GROUP_SIZE = 24  # scalars in one block of the factorization, at least: fewer, l
 def optimize_robustly(problem: Problem, observations: WandObservations, start: State) -> State:
     """Optimize from a rough start with Cauchy's kernel."""
     objective = _Objective(problem, observations, find_weights(problem, observations, start))
-    return _levenberg_marquardt(objective, start, damping=1e-3, robust=True).state
+    return _levenberg_marquardt(objective, start, damping=1e-3, robust=True)[0]
 
 
 def adjust(
@@ -135,9 +135,8 @@ def _optimize_exactly(
         state = locate_points(problem, state, choice.background)
         found = _profile(objective, state) if profiled else None
         if found is None:
-            common = _levenberg_marquardt(objective, state)
-            state, iterations = common.state, iterations + common.iterations
-            found = _profile(objective, state)
+            state, more, _ = _levenberg_marquardt(objective, state)
+            iterations, found = iterations + more, _profile(objective, state)
         profiled, state = found is not None, state if found is None else found
     else:
         weights = find_weights(problem, observations, state)
@@ -207,19 +206,11 @@ class _Step:
     damping: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Minimum:
-    """The optimal state, the number of iterations, and the damping of the last step that was taken."""
-
-    state: State
-    iterations: int
-    damping: float
-
-
 def _levenberg_marquardt(
     objective: _Objective, state: State, damping: float = START_DAMPING, robust: bool = False
-) -> _Minimum:
-    """The optimum, from the `damping` of the step before. Where `robust`, Cauchy's scale follows the residuals."""
+) -> tuple[State, int, float]:
+    """The optimum, the number of iterations and the last damping, from the `damping` of the step before; where
+    `robust`, Cauchy's scale follows the residuals."""
     norms, iterations = objective.norms(state), 0
     while iterations < MAX_ITERATIONS:
         iterations += 1
@@ -234,7 +225,7 @@ def _levenberg_marquardt(
         tolerance = ROBUST_TOLERANCE if robust else TOLERANCE
         if before.cost - step.cost < tolerance * before.cost + ABSOLUTE_TOLERANCE:
             break
-    return _Minimum(state, iterations, damping)
+    return state, iterations, damping
 
 
 def _profile(objective: _Objective, state: State) -> State | None:
@@ -251,8 +242,8 @@ def _profile(objective: _Objective, state: State) -> State | None:
     most, before, damping = len(objective.observations) ** -0.25, 1.0, START_DAMPING  # two residuals each
     for _ in range(MAX_ITERATIONS):
         try:
-            along = _levenberg_marquardt(path, state, damping)
-            state, damping, norms = along.state, along.damping, objective.norms(along.state)
+            state, _, damping = _levenberg_marquardt(path, state, damping)
+            norms = objective.norms(state)
             profiled = profile_motion(objective.linearize(state, norms))
             steps = profiled.step(objective.problem, state, damping)
         except np.linalg.LinAlgError:
