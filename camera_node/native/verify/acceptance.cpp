@@ -6,6 +6,7 @@
 
 #include "verify/level_check.hpp"
 #include "verify/occluded_fit.hpp"
+#include "verify/relit.hpp"
 #include "verify/smoothed_fit.hpp"
 
 namespace roundel {
@@ -215,11 +216,43 @@ std::optional<Refusal> find_refusal(const ImageView& image, const RoundelFit& fi
                                                           : std::optional(Refusal::kNotElliptic);
 }
 
+/// The fit without the edge of a shadow, if that shows the whole roundel. The first outline is one in uneven
+/// light; the second one tells better where paper and ink are. Fields are what the edge's shape leaves.
+static std::optional<RoundelFit> fit_shadowed(const ImageView& image, InitialGuess guess,
+                                              const AcceptanceContext& context, bool known) {
+    guess.model.reset();
+    for (int k = 0; k < 2; ++k) {
+        Relit relit(image, guess);
+        if (!relit.is_explained()) return std::nullopt;
+        InitialGuess& lit = relit.relit_guess;
+        auto fit = fit_photometric(relit.view(), lit);
+        if (fit && k) {
+            lit.model = fit->p;
+            lit.outer = fit->outer;
+            lit.noise = fit->noise;
+            lit.fields = AllowedFields::kAll;
+            fit = fit_photometric(relit.view(), lit);
+        }
+        if (!fit) return std::nullopt;
+        guess.outer = relit.in_image(*fit).outer;
+        guess.ratio = fit->ratio;
+        if (!k) continue;
+        const AcceptanceContext even{context.limits, context.camera, context.noise * relit.noise_gain};
+        TestedFit tested = test(relit.view(), *fit, even);
+        if (!tested.accepted || !(known || is_certain_roundel(relit.view(), *fit, lit, even.noise)))
+            return std::nullopt;
+        tested.fit.unoccluded = false;  // in the image as it is
+        claim_misfit(tested.fit, even.noise);
+        return relit.in_image(tested.fit);
+    }
+    return std::nullopt;
+}
+
 /// Fits a roundel to the image as it is, or smoothed.
 static std::optional<RoundelFit> fit_at_full_size(const ImageView& image, const InitialGuess& guess,
                                                   const AcceptanceContext& context, bool known) {
     const auto fits = fit_on_ground(image, guess);
-    if (!fits) return std::nullopt;
+    if (!fits) return guess.model ? std::nullopt : fit_shadowed(image, guess, context, known);
     const RoundelFit* const first = &fits->even;
     TestedFit tested = test(image, *first, context);
     const bool is_even = tested.fit.unoccluded && !first->uneven;
@@ -241,6 +274,7 @@ static std::optional<RoundelFit> fit_at_full_size(const ImageView& image, const 
     auto& [fit, misfit, elliptic, accepted] = tested;
     claim_misfit(fit, context.noise);
     if (fit.unoccluded || guess.model) return fit.unoccluded ? std::optional(fit) : std::nullopt;
+    if (const auto lit = fit_shadowed(image, guess, context, known)) return lit;
     const double at_edges = misfit ? likely_edge_noise(context, *misfit, fit) : context.noise;
     const auto rest =
         fit_occluded(image, {guess, fit, misfit, at_edges, known || accepted, context.knows_camera});

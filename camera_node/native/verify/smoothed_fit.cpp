@@ -9,8 +9,7 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMargin = 4;       // pixels: the band of the fit, the card and the reach of the mean
-constexpr double kCardReach = 0.8;  // outer diameters: to the edge of a card, and the band of the fit
+constexpr double kMargin = 4;  // pixels: the band of the fit and the reach of the mean
 constexpr double kInflation = (16.0 / 6) * (16.0 / 6);  // noise variance over that of the binomial mean
 
 /// The 3 x 3 binomial mean; the pixels on the image's border are repeated.
@@ -30,14 +29,13 @@ std::vector<uint8_t> binomial_mean(const ImageView& image) {
     return mean;
 }
 
-/// The part of an image within `reach` of a guess.
-struct Surroundings {
-    Surroundings(const ImageView& image, const InitialGuess& guess, double reach)
-        : left(std::max(0, int(guess.outer.x - reach))),
-          top(std::max(0, int(guess.outer.y - reach))),
-          width(std::min(image.width, int(guess.outer.x + reach) + 1) - left),
-          height(std::min(image.height, int(guess.outer.y + reach) + 1) - top) {}
-    int left, top, width, height;
+/// The binomial mean of the surroundings.
+struct Smoothed : Surroundings {
+    Smoothed(const ImageView& image, const InitialGuess& guess)
+        : Surroundings(image, guess.outer, guess.outer.major / 2 + kMargin), moved(in_view(guess)) {
+        levels_ = binomial_mean(image.window(left_, top_, width_, height_));
+    }
+    InitialGuess moved;
 };
 
 /// A place in a picture of half the size, in the pixels of the one that it was made of.
@@ -45,12 +43,29 @@ double doubled(double place, int from) { return from + 2 * place + 0.5; }
 
 }  // namespace
 
-Halved::Halved(const ImageView& image, const InitialGuess& guess) : half_guess(guess) {
-    const Surroundings part(image, guess, kCardReach * guess.outer.major);
-    left_ = part.left;
-    top_ = part.top;
-    width_ = std::max(0, part.width / 2);
-    height_ = std::max(0, part.height / 2);
+Surroundings::Surroundings(const ImageView& image, const Ellipse& outer, double reach) {
+    left_ = std::max(0, int(outer.x - reach));
+    top_ = std::max(0, int(outer.y - reach));
+    width_ = std::max(0, std::min(image.width, int(outer.x + reach) + 1) - left_);
+    height_ = std::max(0, std::min(image.height, int(outer.y + reach) + 1) - top_);
+}
+
+InitialGuess Surroundings::in_view(InitialGuess guess) const {
+    guess.outer.x -= left_;
+    guess.outer.y -= top_;
+    return guess;
+}
+
+RoundelFit Surroundings::in_image(RoundelFit fit) const {
+    for (double* x : {&fit.outer.x, &fit.p[kX], &fit.fields.frame.x}) *x += left_;
+    for (double* y : {&fit.outer.y, &fit.p[kY], &fit.fields.frame.y}) *y += top_;
+    return fit;
+}
+
+Halved::Halved(const ImageView& image, const InitialGuess& guess)
+    : Surroundings(image, guess.outer, kCardReach * guess.outer.major), half_guess(guess) {
+    width_ /= 2;
+    height_ /= 2;
     for (int y = 0; y < height_; ++y) {
         const uint8_t *a = image.row(top_ + 2 * y) + left_, *b = image.row(top_ + 2 * y + 1) + left_;
         for (int x = 0; x < 2 * width_; x += 2)
@@ -76,16 +91,11 @@ RoundelFit Halved::in_image(RoundelFit fit) const {
 }
 
 std::optional<RoundelFit> fit_smoothed(const ImageView& image, const InitialGuess& guess) {
-    const auto [left, top, width, height] = Surroundings(image, guess, guess.outer.major / 2 + kMargin);
-    if (width < 3 || height < 3) return std::nullopt;
-    const std::vector<uint8_t> smooth = binomial_mean(image.window(left, top, width, height));
-    InitialGuess moved = guess;
-    moved.outer.x -= left;
-    moved.outer.y -= top;
-    std::optional<RoundelFit> fit = fit_photometric({smooth.data(), width, height, width}, moved);
+    const Smoothed smooth(image, guess);
+    if (smooth.view().width < 3 || smooth.view().height < 3) return std::nullopt;
+    std::optional<RoundelFit> fit = fit_photometric(smooth.view(), smooth.moved);
     if (!fit) return fit;
-    fit->outer.x += left;
-    fit->outer.y += top;
+    *fit = smooth.in_image(*fit);
     fit->pose_cov = scaled(fit->pose_cov, kInflation);
     return fit;
 }

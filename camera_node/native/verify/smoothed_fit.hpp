@@ -14,19 +14,30 @@ namespace roundel {
 /// Smoothing reduces the noise and correlates adjacent pixels; the covariance is inflated by (16/6)^2.
 std::optional<RoundelFit> fit_smoothed(const ImageView& image, const InitialGuess& guess);
 
-/// The surroundings of a guess at half the size. Paper is never flat and edges that were cut by hand are
-/// uneven in proportion to the size, so a large roundel is judged as one of half the size is.
-class Halved {
+constexpr double kCardReach = 0.8;  // outer diameters: to the edge of a card, and the band of a fit
+
+/// The surroundings of a guess in other levels.
+class Surroundings {
   public:
-    Halved(const ImageView& image, const InitialGuess& guess);
     ImageView view() const { return {levels_.data(), width_, height_, width_}; }
     /// A fit to `view`, as one to the image.
     RoundelFit in_image(RoundelFit fit) const;
-    InitialGuess half_guess;  // in `view`
 
-  private:
+  protected:
+    InitialGuess in_view(InitialGuess guess) const;
+    Surroundings(const ImageView& image, const Ellipse& outer, double reach);
     int left_, top_, width_, height_;
     std::vector<uint8_t> levels_;
+};
+
+/// The same at half the size. Paper is never flat and edges that were cut by hand are uneven in proportion to
+/// the size, so a large roundel is judged as one of half the size is.
+class Halved : public Surroundings {
+  public:
+    Halved(const ImageView& image, const InitialGuess& guess);
+    /// A fit to `view`, as one to the image.
+    RoundelFit in_image(RoundelFit fit) const;
+    InitialGuess half_guess;  // in `view`
 };
 
 }  // namespace roundel

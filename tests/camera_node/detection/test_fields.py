@@ -11,7 +11,7 @@ from tests.benchmarks.detector.bent import measure_bend
 from tests.benchmarks.detector.cameras import acquainted, errors
 from tests.benchmarks.detector.lighting import BAND, KINDS, NOISE, even, gloss, soft_shadow
 from tests.benchmarks.detector.models import Video
-from tests.benchmarks.detector.second.measurement import First, measure_cell
+from tests.benchmarks.detector.second.measurement import First, Second, measure_cell
 from tests.benchmarks.detector.table import Run
 
 RUN = Run("chords", Detector, False)
@@ -57,6 +57,22 @@ def test_uneven_light_is_within_the_claims(what):
     measured = errors(acquainted(RUN, sensor), sensor, BAND, 3, disturb)
     assert measured.found > 0.7
     assert measured.centre < CLAIM
+
+
+@pytest.mark.parametrize(
+    ("show", "share", "pictures"),
+    [
+        (First(NOISE, soft_shadow).show, 0.9, 2),
+        (First(NOISE, partial(soft_shadow, penumbra=0.02)).show, 0.65, 2),
+        (Second(light="shadow").show, 0.85, 1),
+    ],
+    ids=["soft", "hard", "second generator"],
+)
+def test_one_picture_shows_the_edges_of_shadows(show, share, pictures):
+    """Without their light as a hypothesis 82, 62 and 70 % are found, with up to 3 times the claimed variance."""
+    measured = measure_cell(Detector(), show, BAND, pictures)
+    assert measured.found > share
+    assert 0.25 < measured.centre < CLAIM
 
 
 @pytest.mark.parametrize("band", [(20, 32), (32, 60)])
