@@ -166,7 +166,7 @@ class Tracker:
         assignments = self._update_states(associated, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
-        if not self.robust.is_doubtful:
+        if not (self.robust.is_doubtful or self.monitors.rig.contradicting):
             self.geometry.note(summary.mean_px2)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
