@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_POINTS = 1 << 14  # of a curve: more than a page has pixels, and an hour of 50 robots fits into the memory
+MAX_POINTS = 1 << 12  # of a curve: twice as many as a page has pixels; 50 robots with 16,384 took 600 MB
 SUFFIXES = (".png", ".pdf", ".svg")
 MM = 1000.0
 ARROW_M = 0.4  # the length of a camera's optical axis in the top view
