@@ -68,7 +68,7 @@ def export(
         say(f"wrote {out}: {recorded.counts[DETECTIONS]} frames")
         return 0
     poses = RecordedPoses(recording, robots)
-    files = _write(chosen, poses, out, rate_hz)
+    files = _write(chosen, poses, out, rate_hz, force)
     say_skipped(poses.faults)
     for robot, count in sorted(poses.counts.items()):
         say(f"{count:7} poses of {robot}")
@@ -77,10 +77,10 @@ def export(
     return 0
 
 
-def _write(format: Format, poses: RecordedPoses, out: Path, rate_hz: float | None) -> list[Path]:
+def _write(format: Format, poses: RecordedPoses, out: Path, rate_hz: float | None, force: bool) -> list[Path]:
     """Write a file; return what was written."""
     if format == "tum":
-        return write_tum(poses, out)
+        return write_tum(poses, out, force)
     if format in ("c3d", "trc"):
         write = write_c3d if format == "c3d" else write_trc
         write(sample_points(poses, rate_hz), out)

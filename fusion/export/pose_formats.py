@@ -123,11 +123,14 @@ def _parquet_row(pose: RobotPose, seconds: float, index: int) -> tuple:
     )
 
 
-def write_tum(poses: RecordedPoses, path: Path) -> list[Path]:
+def write_tum(poses: RecordedPoses, path: Path, force: bool = False) -> list[Path]:
     """Write `timestamp tx ty tz qx qy qz qw`, as evo and the TUM benchmark read it, to one file for each robot.
 
     Returns:
         the files: `path`, or with several robots NAME-ROBOT and the suffix.
+
+    Raises:
+        ConfigError: one of them exists, and is not replaced by `force`.
     """
     with hidden_folder(path) as folder, contextlib.ExitStack() as opened:
         written: dict[str, IO[str]] = {}
@@ -143,6 +146,8 @@ def write_tum(poses: RecordedPoses, path: Path) -> list[Path]:
         opened.close()
         several = len(written) > 1
         files = [path.with_stem(f"{path.stem}-{robot}") if several else path for robot in written]
+        if existing := [file for file in files if file.exists() and not force]:
+            raise ConfigError(f"{existing[0]} exists; give another name, or --force to replace it")
         for k, file in enumerate(files):
             os.replace(folder / f"{k}", file)
     return files

@@ -238,6 +238,17 @@ def test_tum_has_one_file_for_each_robot(recording: Path, tmp_path: Path):
     assert (tmp_path / "one.tum").read_bytes() == (tmp_path / "out-drone.tum").read_bytes()
 
 
+def test_files_of_single_robots_are_replaced_by_force_only(recording: Path, tmp_path: Path):
+    kept = tmp_path / f"out-{next(iter(BODIES))}.tum"
+    kept.write_text("mine")
+    with pytest.raises(ConfigError, match="--force"):
+        export(recording, tmp_path / "out.tum")
+    assert [file.name for file in tmp_path.iterdir() if file.suffix == ".tum"] == [kept.name]
+    assert kept.read_text() == "mine"
+    export(recording, tmp_path / "out.tum", force=True)
+    assert kept.read_text() != "mine"
+
+
 def test_a_ros_2_bag_has_the_messages_of_the_bridge(recording: Path, tmp_path: Path):
     for is_again in (False, True):  # a bag replaces a bag
         export(recording, tmp_path / "bag", force=is_again)
