@@ -67,7 +67,8 @@ class StampCheck:
             return None
         longest = since - interval  # jump ahead; a smaller one if frames are missing too
         precision = max(abs(step - round(step / interval) * interval) for step in steps) + 1
-        if is_late:
+        if is_late:  # if frames are missing too, stamps jumped back by more, as far as the lag allows
+            precision = precision if longest - interval < least else longest - least
             return StampJump(longest, precision) if longest >= least else None
         if least == -math.inf:
             return StampJump(0.0, max(since % interval, -since % interval))

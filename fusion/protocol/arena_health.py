@@ -91,6 +91,8 @@ def camera_problems(health: CameraHealth) -> list[str]:
         "was moved and is excluded": health.excluded,
         "repeats an old image": health.frozen,
         "two nodes use its name": health.duplicate_publisher,
+        f"its stamps are not known to better than {health.clock_sigma_ms:.0f} ms, because they may have jumped; robots "
+        "in motion will show it": health.clock == "uncertain",
     }
     return [problem for problem, holds in states.items() if holds] + _skipped_frames(health)
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`fusion health` and `fusion doctor`: what an operator reads, and the exit codes that a monitoring system reads."""
 
+import contextlib
 import json
 import os
 import shutil
 import socket
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -155,27 +157,47 @@ def with_a_robot_elsewhere(folder: Path) -> ArenaConfig:
     return settings
 
 
-def test_what_is_missing_or_refused_is_no_health(tmp_path: Path):
-    """A robot that was never found, a camera whose images have another size, and one whose frames come too late."""
+@contextlib.contextmanager
+def server_with_a_robot_elsewhere(folder: Path) -> Iterator[tuple[str, Callable[[], tuple[str, ...]]]]:
+    """A server with a robot that is nowhere: its endpoint, and what its next status says."""
+    folder.mkdir()
     with (
-        ServerProcess(with_a_robot_elsewhere(tmp_path)) as server,
+        ServerProcess(with_a_robot_elsewhere(folder)) as server,
         Client.connect(server.endpoint, arena="test") as client,
     ):
+        yield (
+            server.endpoint,
+            lambda: assess_health(client.status(DEADLINE_S).next(), client.rig(), NOW).problems,
+        )
 
-        def problems() -> tuple[str, ...]:
-            return assess_health(client.status(DEADLINE_S).next(), client.rig(), NOW).problems
 
-        with cameras_at(server.endpoint):
+def test_what_is_missing_or_refused_is_no_health(tmp_path: Path):
+    """A robot that was never found, a camera whose images have another size, and one whose stamps jump by a second
+    while it is started again."""
+    with server_with_a_robot_elsewhere(tmp_path / "server") as (endpoint, problems):
+        with cameras_at(endpoint):
             wait_for(lambda: any(p.startswith("robot ghost was never found: ") for p in problems()))
             wait_for(lambda: not any(p.startswith("camera") for p in problems()))
-        with cameras_at(server.endpoint, altered=smaller):
+        with cameras_at(endpoint, altered=smaller):
             wait_for(
                 lambda: any(
                     "cam1: frames of the last 10 s" in p and "wrong image size" in p for p in problems()
                 )
             )
-        with cameras_at(server.endpoint, altered=delayed):
-            wait_for(lambda: any("cam2: frames of the last 10 s" in p and LATE in p for p in problems()))
+        with cameras_at(endpoint, altered=delayed):
+            wait_for(
+                lambda: any(
+                    p.startswith("camera cam2: its stamps are not known to better") for p in problems()
+                )
+            )
+
+
+def test_frames_that_always_come_too_late_are_no_health(tmp_path: Path):
+    with (
+        server_with_a_robot_elsewhere(tmp_path / "server") as (endpoint, problems),
+        cameras_at(endpoint, altered=delayed),
+    ):
+        wait_for(lambda: any("cam2: frames of the last 10 s" in p and LATE in p for p in problems()))
 
 
 def smaller(message: Detections) -> Detections:

@@ -53,6 +53,15 @@ def test_a_jump_below_the_jitter_is_known_or_in_doubt(step_ms: float):
     assert sum(covered) >= N_RUNS - MAX_WRONG
 
 
+def test_frames_that_are_missing_while_stamps_jump_back_make_the_jump_uncertain():
+    """A node that is started again: the interval alone shows 300 ms less. The standard deviation covers the truth."""
+    captured = [t + 300_000_000 * (k >= HISTORY) for k, t in enumerate(regular())]
+    stamps = [t - 10**9 * (k >= HISTORY) for k, t in enumerate(captured)]
+    for seed in range(N_RUNS):
+        (jump,) = jumps(captured, stamps, 1.0, seed)
+        assert abs(-1e9 - jump.ahead_ns) <= jump.sigma_ns < 0.4e9
+
+
 @pytest.mark.parametrize("jitter_ms", [1.0, 50.0])
 def test_a_pause_of_the_camera_is_no_jump(jitter_ms: float):
     """Where lags vary less than the pause they rule a jump out; else the clock is in doubt by less than the pause."""
