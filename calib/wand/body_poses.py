@@ -140,27 +140,29 @@ class BodyLocator:
             least[k] = min(least[k], costs[c])
         return allowed
 
-    def handovers(self, t_s: Array) -> Array:
-        """Those of the times (K,) at which no camera sees a marker, but that are next to a frame of a placed one, and
-        near enough that the wand's motion about that frame gives its pose; `locate` knows it from now on."""
-        t_s, seen = t_s[~self.sees(t_s)], self._seen_s()
+    def locate_by_motion(self, t_s: Array) -> Array:
+        """Locate the wand at those of the times (K,), at which no camera sees it, that are next to a frame of a placed
+        camera, and near enough that the motion about that frame gives the pose; `locate` knows it from now on.
+
+        Returns:
+            these times.
+        """
+        if not len(t_s):
+            return t_s
+        seen = self._seen_s()
         nearest: dict[
             tuple[int, bool], float
-        ] = {}  # time by the number of the frame, and whether that is before
+        ] = {}  # by the number of the frame, and whether that is before the time
         for t in t_s.tolist():
             after = int(np.searchsorted(seen, t))
             for k in range(max(after - 1, 0), min(after + 1, len(seen))):
                 name, apart = (k, bool(seen[k] < t)), abs(t - seen[k])
                 if apart <= self.gap_s and (name not in nearest or apart < abs(nearest[name] - seen[k])):
                     nearest[name] = t
-        for (k, before), t in nearest.items():
-            reach = seen[k] + (-self.gap_s if before else self.gap_s)
-            far = (
-                int(np.searchsorted(seen, reach))
-                if before
-                else int(np.searchsorted(seen, reach, "right")) - 1
-            )
-            if far != k:
+        for (k, is_before), t in nearest.items():
+            first = np.searchsorted(seen, seen[k] - self.gap_s)
+            last = np.searchsorted(seen, seen[k] + self.gap_s, "right") - 1
+            if (far := int(first if is_before else last)) != k:
                 self.located[t] = self._extrapolate(float(seen[far]), float(seen[k]), t)
         return np.array(sorted({t for t in nearest.values() if self.located.get(t)}))
 
@@ -451,11 +453,12 @@ def _place(
 
 
 def _collect(locator: BodyLocator, detections: WandDetections) -> _Images | None:
-    """The images in up to `FRAMES` frames in which the locator knows the body's pose, of few also those at handovers;
-    None without any."""
+    """The images in up to `FRAMES` frames in which the locator knows the body's pose, if these are few by its motion
+    too; None without any."""
     every = np.unique(detections.t_s)
-    seen = every[locator.sees(every)]
-    moving = locator.handovers(every) if len(seen) < FEW_FRAMES else seen[:0]
+    is_seen = locator.sees(every)
+    seen = every[is_seen]
+    moving = locator.locate_by_motion(every[~is_seen]) if len(seen) < FEW_FRAMES else seen[:0]
     times = np.union1d(seen, moving)
     times = times[spread_evenly(len(times), FRAMES)]
     points, rows, pose, frame_of_pose = [], [], [], []

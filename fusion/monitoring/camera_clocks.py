@@ -69,8 +69,8 @@ class _Clock:
     def health(self) -> ClockHealth:
         offset_s, sigma_s = self.at(self.now_ns), self.known_s
         size_s = max(REPORTED_S, abs(offset_s))
-        # However large a correction, robots of 1 m/s are not located by a clock that is not known to 5 ms.
-        is_uncertain = sigma_s > min(size_s, MAX_MOTION_M)
+        # However large a correction, such a clock does not locate a robot of 1 m/s.
+        is_uncertain = sigma_s > size_s or 1.0 * sigma_s > MAX_MOTION_M
         state = "uncertain" if is_uncertain else "corrected" if size_s > REPORTED_S else "correct"
         return ClockHealth(state, 1e3 * offset_s, 1e3 * sigma_s)
 

@@ -101,7 +101,8 @@ def _locate_missing(
         dict(enumerate(offset_s.tolist())),
         recording.timing.gap_s,
     )
-    locator.handovers(knot_s[missing])
+    unseen = knot_s[missing]
+    locator.locate_by_motion(unseen[~locator.sees(unseen)])
     basis, markers = basis.copy(), points[AffineWand.of(recording.wand).basis]
     for k, allowed in zip(missing.tolist(), locator.locate(knot_s[missing]), strict=True):
         if allowed:
@@ -125,12 +126,11 @@ def _choose_detections(recording: WandRecording, offset_s: Array, budget: int) -
     true_s = detections.t_s + offset_s[detections.camera]
     order = np.argsort(true_s, kind="stable")
     group = _groups(recording, true_s)
-    apart = group.max() > 0
-    frame_set = _frame_sets(recording, true_s, order, 1 if apart else 2)
+    frame_set = _frame_sets(recording, true_s, order, 1 if group.any() else 2)
     rows = order[frame_set[order] >= 0]
     sizes = np.array([(lens.width, lens.height) for lens in recording.lenses], float)
     selected, numbers = detections.select(rows), frame_set[rows]
-    between = np.flatnonzero(_handovers(numbers, group[selected.camera])) if apart else numbers[:0]
+    between = _between_groups(numbers, group[selected.camera])
     chosen = choose_frame_sets(selected, numbers, sizes, budget, between)
     rows = rows[chosen[frame_set[rows]]]
     knot = np.unique(frame_set[rows], return_inverse=True)[1]
@@ -168,13 +168,13 @@ def _frame_sets(recording: WandRecording, true_s: Array, order: Index, least: in
     return frame_set
 
 
-def _handovers(frame_set: Index, group: Index) -> Mask:
-    """(K,) the frame sets next to one that another group of cameras saw, or that two saw, from the ascending frame sets
-    (n,) of detections and the groups (n,) of their cameras."""
+def _between_groups(frame_set: Index, group: Index) -> Index:
+    """The frame sets next to one that another group of cameras saw, or that two saw, from the ascending frame sets (n,)
+    of detections and the groups (n,) of their cameras."""
     first = np.flatnonzero(np.diff(frame_set, prepend=-1))
     least, most = np.minimum.reduceat(group, first), np.maximum.reduceat(group, first)
     changes = least[1:] != most[:-1]
-    return (least != most) | np.append(changes, False) | np.append(False, changes)
+    return np.flatnonzero((least != most) | np.append(changes, False) | np.append(False, changes))
 
 
 def _middle_times(t_s: Array, knot: Index) -> Array:

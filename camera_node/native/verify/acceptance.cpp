@@ -6,7 +6,7 @@
 
 #include "verify/level_check.hpp"
 #include "verify/occluded_fit.hpp"
-#include "verify/relit.hpp"
+#include "verify/shadow_edge.hpp"
 #include "verify/smoothed_fit.hpp"
 
 namespace roundel {
@@ -222,28 +222,28 @@ static std::optional<RoundelFit> fit_shadowed(const ImageView& image, InitialGue
                                               const AcceptanceContext& context, bool known) {
     guess.model.reset();
     for (int k = 0; k < 2; ++k) {
-        Relit relit(image, guess);
-        if (!relit.is_explained()) return std::nullopt;
-        InitialGuess& lit = relit.relit_guess;
-        auto fit = fit_photometric(relit.view(), lit);
+        WithoutShadow even_light(image, guess);
+        if (!even_light.is_explained()) return std::nullopt;
+        InitialGuess& lit = even_light.even_guess;
+        auto fit = fit_photometric(even_light.view(), lit);
         if (fit && k) {
             lit.model = fit->p;
             lit.outer = fit->outer;
             lit.noise = fit->noise;
             lit.fields = AllowedFields::kAll;
-            fit = fit_photometric(relit.view(), lit);
+            fit = fit_photometric(even_light.view(), lit);
         }
         if (!fit) return std::nullopt;
-        guess.outer = relit.in_image(*fit).outer;
+        guess.outer = even_light.in_image(*fit).outer;
         guess.ratio = fit->ratio;
         if (!k) continue;
-        const AcceptanceContext even{context.limits, context.camera, context.noise * relit.noise_gain};
-        TestedFit tested = test(relit.view(), *fit, even);
-        if (!tested.accepted || !(known || is_certain_roundel(relit.view(), *fit, lit, even.noise)))
+        const AcceptanceContext even{context.limits, context.camera, context.noise * even_light.noise_gain};
+        TestedFit tested = test(even_light.view(), *fit, even);
+        if (!tested.accepted || !(known || is_certain_roundel(even_light.view(), *fit, lit, even.noise)))
             return std::nullopt;
         tested.fit.unoccluded = false;  // in the image as it is
         claim_misfit(tested.fit, even.noise);
-        return relit.in_image(tested.fit);
+        return even_light.in_image(tested.fit);
     }
     return std::nullopt;
 }

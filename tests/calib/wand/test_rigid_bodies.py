@@ -180,7 +180,7 @@ def test_the_motion_of_the_wand_gives_its_pose_in_a_frame_next_to_those_of_place
     p = np.array([transform(pose(t), CUBE.points) for t in t_s])
     tracks = [[MarkerTrack.of(t_s, p[:, k, :2] / p[:, k, 2:]) for k in range(16)]]
     locator = BodyLocator(tracks, CUBE.points, {0: np.eye(4)}, {0: 0.0}, 0.12)
-    times = locator.handovers(np.array([-0.15, -0.08, -0.04, 0.24, 0.28, 0.4]))
+    times = locator.locate_by_motion(np.array([-0.15, -0.08, -0.04, 0.24, 0.28, 0.4]))
     assert times.tolist() == [-0.04, 0.24]
     for t, (found,) in zip(times, locator.locate(times), strict=True):
         assert found == pytest.approx(pose(t), abs=1e-3)

@@ -119,7 +119,7 @@ def test_a_process_that_judges_is_started_again_after_it_was_killed():
     ("kind", "cameras", "reported"),
     [("drifting 0.3 deg in 10 s", 3, "right"), ("bar 0.5 deg", 4, "undecided")],
 )
-def test_no_innocent_is_blamed(kind: str, cameras: int, reported: str):
+def test_no_other_camera_or_robot_is_reported(kind: str, cameras: int, reported: str):
     """A pose that drifts on after its new pose is known is no clock of another camera; two cameras that turn together
     displace no robot's markers."""
     outcome = run(Case(kind=kind, cameras=cameras, seed=0))

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-#include "verify/relit.hpp"
+#include "verify/shadow_edge.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -32,7 +32,7 @@ constexpr int kUnknowns = kTurn + 1;
 using Light = Vector<kUnknowns>;
 
 /// The share of the light at a place, and what a step across the edge changes.
-struct Lit {
+struct LightAt {
     double share, across, along, off, slope;
 };
 
@@ -40,7 +40,7 @@ struct Lit {
 class ShadowEdge {
   public:
     explicit ShadowEdge(const Light& q) : q_(q), c_(std::cos(q[kTurn])), s_(std::sin(q[kTurn])) {}
-    Lit at(double x, double y) const {
+    LightAt at(double x, double y) const {
         const double across = c_ * x + s_ * y, along = c_ * y - s_ * x;
         const double off = across - q_[kAt] + q_[kCurve] / 2 * square(along), u = off / q_[kWidth];
         return {1 - q_[kLoss] * std::erfc(-u / std::numbers::sqrt2) / 2, across, along, off,
@@ -97,6 +97,7 @@ std::optional<Light> find_edge(const std::vector<Point>& points) {
     for (const double turn : {down - kTurned, down, down + kTurned}) {
         const double c = std::cos(turn), s = std::sin(turn);
         for (int j = 0; j < kOffsets; ++j) {
+            // Beyond 0.9 outer radii lie 2 % of the disc.
             const double at = 1.8 * (j + 0.5) / kOffsets - 0.9;
             const auto shade = [&](const Point& p) {
                 return std::clamp(0.5 + (c * p.x + s * p.y - at) / (4 * kFirstWidth), 0.0, 1.0);
@@ -132,7 +133,7 @@ std::optional<Light> find_edge(const std::vector<Point>& points) {
 /// Gauss-Newton with Cauchy's weights; the scale of the residuals, infinite if it does not converge.
 double refine(const std::vector<Point>& points, Light& q) {
     double scale = INFINITY;
-    std::vector<Lit> lit(points.size(), Lit{});
+    std::vector<LightAt> lit(points.size(), LightAt{});
     std::vector<double> off(points.size());
     for (int k = 0; k < kSteps; ++k) {
         const ShadowEdge light(q);
@@ -170,8 +171,8 @@ double refine(const std::vector<Point>& points, Light& q) {
 
 }  // namespace
 
-Relit::Relit(const ImageView& image, const InitialGuess& guess)
-    : Surroundings(image, guess.outer, kCardReach * guess.outer.major), relit_guess(in_view(guess)) {
+WithoutShadow::WithoutShadow(const ImageView& image, const InitialGuess& guess)
+    : Surroundings(image, guess.outer, kCardReach * guess.outer.major), even_guess(in_view(guess)) {
     auto found = find_edge(read_points(image, guess, kFew));
     if (!found) return;
     const std::vector<Point> points = read_points(image, guess, kPixels);
@@ -191,8 +192,8 @@ Relit::Relit(const ImageView& image, const InitialGuess& guess)
             const double level = image.row(top_ + y)[left_ + x] / share;
             levels_[size_t(y) * size_t(width_) + size_t(x)] = uint8_t(std::lround(std::min(level, 255.0)));
         }
-    relit_guess.dark = q[kInk];
-    relit_guess.bright = std::min(255.0, q[kPaper]);
+    even_guess.dark = q[kInk];
+    even_guess.bright = std::min(255.0, q[kPaper]);
 }
 
 }  // namespace roundel
