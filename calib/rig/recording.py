@@ -128,7 +128,10 @@ class RecordingWriter:
 
 
 def read_messages(
-    path: Path, faults: Counter[str] | None = None, limits: ReadLimits | None = None
+    path: Path,
+    faults: Counter[str] | None = None,
+    limits: ReadLimits | None = None,
+    from_ns: int | None = None,
 ) -> Iterator[tuple[str, bytes, int]]:
     """Yield key, bytes and time of arrival (ns) of each message, in the order of arrival.
 
@@ -138,16 +141,18 @@ def read_messages(
         path: the MCAP file.
         faults: is given what was skipped, at the end; without it, a recording that is not whole raises there.
         limits: see `ReadLimits`.
+        from_ns: messages that arrived earlier are left out; the file is not read up to them where its index is whole.
 
     Raises:
         ConfigError: the file is missing, or not an MCAP file.
     """
     try:
         with path.open("rb") as file:
-            reader = RecordingReader(file, limits or ReadLimits())
+            reader = RecordingReader(file, limits or ReadLimits(), from_ns)
             try:
                 for message in reader:
-                    yield message.key, message.data, message.t_ns
+                    if from_ns is None or message.t_ns >= from_ns:
+                        yield message.key, message.data, message.t_ns
             finally:
                 if faults is not None:
                     faults |= reader.faults()  # the larger count: a file may be read several times

@@ -100,6 +100,8 @@ class RecordingReader:
     Args:
         file: it is read in portions; memory is bounded by the limits.
         limits: see `ReadLimits`.
+        from_ns: chunks that end before this time are not read, where the index at the end defines their keys; what is
+            missing is then unknown.
 
     Attributes:
         channels, schemas: the contents of their records, by number; `keys` are those of the channels.
@@ -115,6 +117,7 @@ class RecordingReader:
 
     file: IO[bytes]
     limits: ReadLimits = field(default_factory=ReadLimits)
+    from_ns: int | None = None
     channels: dict[int, bytes] = field(default_factory=dict)
     schemas: dict[int, bytes] = field(default_factory=dict)
     keys: dict[int, str] = field(default_factory=dict)
@@ -150,6 +153,8 @@ class RecordingReader:
     @property
     def n_missing(self) -> int:
         """Messages that the recorder wrote and this reader did not find, as far as that is known."""
+        if self.from_ns is not None:
+            return 0
         stated = self.statistics.n_messages - self.n_messages if self.statistics else 0
         return max(stated, self._n_gaps)
 
@@ -299,8 +304,8 @@ class RecordingReader:
         self.has_header = True
         return True
 
-    def _chunk_sizes(self, length: int) -> tuple[str, int, int, int] | None:
-        """Compression, compressed size, size and check sum of the chunk whose content begins here; else None.
+    def _chunk_sizes(self, length: int) -> tuple[str, int, int, int, int] | None:
+        """Compression, compressed size, size, check sum and last time of the chunk whose content begins here; or None.
 
         The opcode has no part in it: the sizes agree by chance in no other record.
         """
@@ -308,20 +313,29 @@ class RecordingReader:
         self.file.seek(-len(content), 1)
         if length < CHUNK.size + 8 or len(content) < CHUNK.size + 8:
             return None
-        _, _, size, check_sum, n = CHUNK.unpack_from(content)
+        _, end_ns, size, check_sum, n = CHUNK.unpack_from(content)
         compression = content[CHUNK.size : CHUNK.size + n]
         if n > 4 or compression not in COMPRESSIONS or len(content) < CHUNK.size + n + 8:
             return None
         compressed = int.from_bytes(content[CHUNK.size + n : CHUNK.size + n + 8], "little")
         if CHUNK.size + n + 8 + compressed != length:
             return None
-        return compression.decode(), compressed, size, check_sum
+        return compression.decode(), compressed, size, check_sum, end_ns
 
     def _read_chunk(
-        self, start: int, end: int, opcode: int, compression: str, compressed: int, size: int, check_sum: int
+        self,
+        start: int,
+        end: int,
+        opcode: int,
+        compression: str,
+        compressed: int,
+        size: int,
+        check_sum: int,
+        end_ns: int,
     ) -> FilePart:
         chunk = compression, compressed, size
-        if compressed > self.limits.chunk_bytes:
+        is_earlier = self.from_ns is not None and self.is_complete and end_ns < self.from_ns
+        if is_earlier or compressed > self.limits.chunk_bytes:
             return FilePart(start, end, opcode, b"", chunk)
         self.file.seek(end - compressed)
         data = self.file.read(compressed)

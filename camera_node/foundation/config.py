@@ -157,9 +157,12 @@ def _without_numpy(value: Any) -> Any:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file so that a reader sees either the old content or the new one; text is encoded in UTF-8.
 
+    What a symbolic link points to is written, and an older file's permissions are kept.
+
     Raises:
         ConfigError: the folder does not exist or is not writable.
     """
+    path = Path(os.path.realpath(path))
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
@@ -167,7 +170,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
                 file.write(content.encode() if isinstance(content, str) else content)
                 file.flush()
                 os.fsync(file.fileno())
-            os.chmod(name, 0o644)
+            os.chmod(name, path.stat().st_mode & 0o777 if path.exists() else 0o644)
             os.replace(name, path)
         except BaseException:
             with contextlib.suppress(OSError):  # what went wrong first is to be reported

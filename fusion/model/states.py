@@ -69,7 +69,7 @@ class States(Columns):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """The robots at one time, `tracked` (R,) tells which of them are known."""
+    """The robots at one time; `tracked` (R,) tells which of them detections determine, if the rig is right."""
 
     t_ns: int
     states: States

@@ -23,6 +23,7 @@ log = logging.getLogger("fusion")
 ClockState = Literal["correct", "uncertain", "corrected"]
 REPORTED_S = 0.0005  # smallest correction that is reported; later ones when it has doubled
 MAX_MOTION_M = 0.005  # of a robot in the standard deviation of a camera's clock, so that it locates the robot
+CERTAIN = 3.0  # standard deviations of a clock
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
 
 
@@ -108,9 +109,10 @@ class CameraClocks:
         stamps jumped, or may have, else 0."""
         name, clock = frame.camera, self._clocks[frame.camera]
         clock.now_ns = frame.t_ns
-        jump = clock.check.add(frame.t_ns, frame.received_ns)
+        least_lag_s = clock.at(frame.t_ns) - CERTAIN * clock.known_s
+        jump = clock.check.add(frame.t_ns, frame.received_ns, 1e9 * least_lag_s)
         if jump is None:
-            return 0.0
+            return self._refute(frame)
         sigma_s = 1e-9 * jump.sigma_ns
         if not jump.ahead_ns:
             clock.sigma_s = math.hypot(clock.sigma_s, sigma_s)
@@ -120,6 +122,22 @@ class CameraClocks:
         message = "camera %s: its stamps jumped by %.0f ms; they are corrected, now by %.1f ms"
         log.warning(message, name, 1e-6 * jump.ahead_ns, 1e3 * clock.at(frame.t_ns), extra=about(name))
         return sigma_s
+
+    def _refute(self, frame: CalibratedFrame) -> float:
+        """Forget a correction by which a frame would arrive long before it was sent: the stamps jumped back, unnoticed
+        so soon after the jump before. The standard deviation of the clock, s, is the correction; 0 if there is none."""
+        wrong_s = self._clocks[frame.camera].at(frame.t_ns)
+        if frame.t_ns + 1e9 * wrong_s <= frame.received_ns + MAX_AHEAD_NS or not wrong_s:
+            return 0.0
+        self.reset(frame.camera)
+        clock = self._clocks[frame.camera]
+        clock.now_ns, clock.sigma_s = frame.t_ns, abs(wrong_s)
+        log.warning(
+            "camera %s: its stamps jumped back; they are no longer corrected by %.1f ms",
+            *(frame.camera, 1e3 * wrong_s),
+            extra=about(frame.camera),
+        )
+        return abs(wrong_s)
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None if that time is in the future."""

@@ -35,10 +35,15 @@ class StampCheck:
         self._stamps: deque[int] = deque(maxlen=LEARNED)
         self._lags: deque[int] = deque(maxlen=HISTORY)
 
-    def add(self, t_ns: int, received_ns: int) -> StampJump | None:
-        """Whether the stamp of the next frame shows a jump, or may; the frames before it are forgotten then."""
+    def add(self, t_ns: int, received_ns: int, least_lag_ns: float = 0.0) -> StampJump | None:
+        """Whether the stamp of the next frame shows a jump, or may; the frames before it are forgotten then.
+
+        Args:
+            t_ns, received_ns: its stamp and its arrival.
+            least_lag_ns: between these, if the frame is not to arrive before it was sent: the correction of the stamps.
+        """
         lag = received_ns - t_ns
-        jump = self._jump(t_ns, lag) if len(self._lags) >= LEARNED else None
+        jump = self._jump(t_ns, lag, least_lag_ns) if len(self._lags) >= LEARNED else None
         if jump is not None:
             self._stamps.clear()
             self._lags.clear()
@@ -46,7 +51,7 @@ class StampCheck:
         self._lags.append(lag)
         return jump
 
-    def _jump(self, t_ns: int, lag: int) -> StampJump | None:
+    def _jump(self, t_ns: int, lag: int, least_lag: float) -> StampJump | None:
         stamps = sorted(self._stamps)
         steps = [after - before for before, after in pairwise(stamps)]
         intervals = [max(1.0, median(steps)) / n for n in MISSED]
@@ -60,7 +65,7 @@ class StampCheck:
             least, most = -math.inf, math.inf
         is_early, is_late = least > 0, most < 0 and since < interval
         # Without that, a queue that ended, for which frames were skipped, looks like a jump.
-        is_before_sent = is_early and lag < 0
+        is_before_sent = is_early and lag < least_lag
         if not all(_is_multiple(step, interval) for step in steps):
             return StampJump(usual - lag, high - low + MIN_JUMP_NS) if is_before_sent else None
         if not is_before_sent and self._is_regular(t_ns, interval):

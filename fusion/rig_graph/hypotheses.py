@@ -274,15 +274,15 @@ def judge(window: Window, starts: Array) -> Verdict:
 
 
 def _compare(window: Window, as_stated: Sequence[Fit], starts: Array) -> Verdict:
-    n = len(window.names)
+    n, seeing = len(window.names), np.unique(window.camera).tolist()
     everything = fit(window, Hypothesis.of(None, range(n), n, starts))
     if not everything.is_adequate():  # nor is any other hypothesis
         return Verdict(None, tuple(range(n)), everything)
-    fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in range(n)]
-    if n > MIN_FOR_PAIRS:
+    fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in seeing]
+    if len(seeing) > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
-    return decide([*as_stated, *fits], n)
+    return decide([*as_stated, *fits], seeing)
 
 
 def _scaled(window: Window, none: Fit) -> Fit:
@@ -328,8 +328,10 @@ def is_contradicted(none: Fit, n_cameras: int) -> bool:
     return bool(score > none.variance * chdtri(ERRORS * n_cameras, FALSE_ALARM))
 
 
-def decide(fits: Sequence[Fit], n_cameras: int) -> Verdict:
-    """Accept the best hypothesis if it beats all others, and if a majority of the cameras is not at fault.
+def decide(fits: Sequence[Fit], seeing: Sequence[int]) -> Verdict:
+    """Accept the best hypothesis if it beats all others, and if a majority of the cameras `seeing` is not at fault.
+
+    Only cameras that see robots count: of three, one that turned looks like the two others that turned together.
 
     A hypothesis that frees more than the best one is no rival: it contains that one, and its penalty says that it
     explains no more. One camera at fault is more probable than larger errors of all, by `RIVAL`;
@@ -345,13 +347,13 @@ def decide(fits: Sequence[Fit], n_cameras: int) -> Verdict:
         if not best.hypothesis.is_part_of(f.hypothesis)
         and not f.hypothesis.odds
         and score[id(f)] < limit
-        and (not best.hypothesis.odds or 2 * len(f.hypothesis.cameras) < n_cameras)
+        and (not best.hypothesis.odds or 2 * len(f.hypothesis.cameras) < len(seeing))
     ]
     cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
-    if not rivals and 2 * len(cameras) < n_cameras:
+    if not rivals and 2 * len(cameras) < len(seeing):
         return Verdict(cause, cameras, best)
     named = {k for f in (best, *rivals) for k in f.hypothesis.cameras}
-    return Verdict(None, tuple(range(n_cameras) if best.hypothesis.odds else sorted(named)), best)
+    return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best)
 
 
 def _suspects(poses: Sequence[Fit]) -> list[int]:

@@ -68,7 +68,9 @@ CONFIRMED = 3  # checks that do not decide, before that is reported
 MAX_SIGMA_PX = 0.3  # of an accepted pose, at the markers that show it
 MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be far off either
 LARGE = 2.0  # factor of the rig's errors that is reported
-FALL = 0.5**0.125  # of that factor in a window that contradicts nothing
+# Of that factor in a window that contradicts nothing: it shows a part of the arena; one in which all cameras take part
+# that contradicted each other shows that they agree again.
+FALL, AGREED_FALL = 0.5**0.125, 0.5
 MAX_KNOWN = 4  # poses of a camera, to which it may return
 
 
@@ -103,6 +105,7 @@ class RigMonitor:
         self._scale = (
             1.0  # of the rig's errors, accepted; claims may count them larger while nothing is decided
         )
+        self._doubted: set[str] = set()  # cameras that contradicted each other when claims grew
         self.is_settled = False
         self.executor: Executor | None = None
         self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
@@ -114,8 +117,8 @@ class RigMonitor:
         """Continue with the same cameras and other robots."""
         self.inherit_poses(old)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
-        self._scale = old._scale
-        self._cameras.scale_errors(old._cameras.error_scale)
+        self._scale, self._doubted = old._scale, old._doubted
+        self._cameras.scale_errors(old._scale, old._cameras.error_scale)
 
     def inherit_poses(self, old: "RigMonitor") -> None:
         """The poses that another monitor of the same cameras knows, and those that a user confirmed."""
@@ -226,9 +229,13 @@ class RigMonitor:
             self._keyframes.clear()
         self._is_contradicted = bool(names) or self._n_undecided == 1
         if verdict.cause is None:
-            scales = next_scales(self._scale, self._cameras.error_scale, verdict, self._n_undecided > 1)
+            self._doubted |= set(names if names or not verdict.is_of_rig else window.names)
+            fall = AGREED_FALL if self._doubted <= set(_seeing(window)) else FALL
+            scales = next_scales(self._scale, self._cameras.error_scale, verdict, self._n_undecided > 1, fall)
             self._scale, claimed = scales
-            self._cameras.scale_errors(claimed)
+            if self._scale == claimed:
+                self._doubted.clear()
+            self._cameras.scale_errors(claimed if verdict.is_of_rig else self._scale, claimed)
         if names:
             self._size_m = _claim_m(window) * verdict.misfit**0.5
         self._note_undecided(names if self._n_undecided >= CONFIRMED else self._underrated())
@@ -252,8 +259,7 @@ class RigMonitor:
 
     def _returned(self, window: Window) -> tuple[ExtrinsicsCorrection, ...]:
         """The excluded cameras that agree with the others, as they were: nothing is at fault in the window."""
-        count = np.bincount(window.camera, minlength=len(window.names))
-        names = [n for n, k in zip(window.names, count, strict=True) if n in self.excluded and k >= ERRORS]
+        names = [name for name in _seeing(window) if name in self.excluded]
         for name in names:
             self._use(name)
         return tuple(ExtrinsicsCorrection(name, self._cameras[name], has_returned=True) for name in names)
@@ -335,7 +341,8 @@ class RigMonitor:
         self._walk.forget_poses()
         self._is_contradicted, self._n_undecided = False, 0
         self._scale = 1.0
-        self._cameras.scale_errors(1.0)
+        self._cameras.scale_errors(1.0, 1.0)
+        self._doubted.clear()
         self._clocks.clear()
         self._note_undecided(())
 
@@ -380,12 +387,20 @@ def _measure(
     return int(times[is_new].mean()), *fit(shown, verdict.fit.hypothesis).equations
 
 
-def next_scales(accepted: float, claimed: float, verdict: Verdict, is_confirmed: bool) -> tuple[float, float]:
+def _seeing(window: Window) -> list[str]:
+    """The cameras with enough detections to determine their errors."""
+    count = np.bincount(window.camera, minlength=len(window.names))
+    return [name for name, k in zip(window.names, count, strict=True) if k >= ERRORS]
+
+
+def next_scales(
+    accepted: float, claimed: float, verdict: Verdict, is_confirmed: bool, fall: float
+) -> tuple[float, float]:
     """The factors of the rig's errors that is accepted and that claims have, after a verdict that finds no single
-    camera at fault. Claims grow at once. Both fall slowly: a window shows a part of the arena."""
-    found, fall = accepted * verdict.scale, 1.0 if verdict.cameras or verdict.is_of_rig else FALL
-    accepted = found if verdict.is_of_rig and is_confirmed else max(1.0, accepted * fall)
-    return accepted, max(accepted, found, claimed * fall)
+    camera at fault. Claims grow at once, and fall by `fall`."""
+    found, holds = accepted * verdict.scale, bool(verdict.cameras) or verdict.is_of_rig
+    accepted = found if verdict.is_of_rig and is_confirmed else max(1.0, accepted * (1.0 if holds else FALL))
+    return accepted, max(accepted, found, claimed * (1.0 if holds else fall))
 
 
 def _is_stationary(cost: Array) -> bool:

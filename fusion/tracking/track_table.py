@@ -63,6 +63,11 @@ class TrackTable:
         """(N,) robots whose status is `tracked`."""
         return np.array([status == "tracked" for status in self.status], bool)
 
+    @property
+    def located(self) -> Mask:
+        """(N,) robots that the last frame set shows and determines, if the rig is right: claims may be wider."""
+        return self._seen & self.alive & ~self._is_uncertain(self.states.P)
+
     def unseen_s(self, t_ns: int) -> Array:
         """(N,) seconds until `t_ns` since the last frame set that observed each robot; 0 for those in acquisition."""
         return np.where(self._seen_ns > 0, np.maximum(t_ns - self._seen_ns, 0) * 1e-9, 0.0)
@@ -125,7 +130,7 @@ class TrackTable:
         seen[self.markers.robot[assignments.marker]] = True
         self._seen, self._seen_ns[seen] = seen, t_ns
         silent = (t_ns - self._seen_ns) * 1e-9 > self._limits.lost_after_s
-        uncertain = self._is_uncertain()
+        uncertain = self._is_uncertain(self.claimed)
         newly_lost = []
         for k, status in enumerate(self.status):
             if seen[k]:
@@ -201,9 +206,9 @@ class TrackTable:
         omega[rows] = v[rows] = 0
         self.states = replace(self.states, omega=omega, v=v)
 
-    def _is_uncertain(self) -> Mask:
-        """(N,) robots with a position sigma above `tracked_sigma_m` along some direction."""
-        position, limit = self.claimed[:, POSITION, POSITION], self._limits.tracked_sigma_m**2
+    def _is_uncertain(self, covariance: Array) -> Mask:
+        """(N,) robots with a position sigma above `tracked_sigma_m` in some direction, by covariances (N, 12, 12)."""
+        position, limit = covariance[:, POSITION, POSITION], self._limits.tracked_sigma_m**2
         uncertain = np.einsum("nii->n", position) > limit  # the trace bounds every eigenvalue
         uncertain[uncertain] = np.linalg.eigvalsh(position[uncertain])[:, -1] > limit
         return uncertain

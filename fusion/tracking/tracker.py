@@ -111,7 +111,7 @@ class Tracker:
         """A frame in corrected time; None while its camera is withheld, or if that time is in the future."""
         t_ns, table = self.table.t_ns, self.table
         return self.monitors.admit(
-            frame, None if t_ns is None else Snapshot(t_ns, table.states, table.tracked)
+            frame, None if t_ns is None else Snapshot(t_ns, table.states, table.located)
         )
 
     def track(self, frame_set: FrameSet) -> TrackingResult:
@@ -182,7 +182,7 @@ class Tracker:
 
     def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection, ...]:
         """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
-        now = Snapshot(frame_set.t_ns, self.table.states, self.table.tracked)
+        now = Snapshot(frame_set.t_ns, self.table.states, self.table.located)
         is_doubtful = self.robust.is_doubtful
         corrections = self.monitors.check_extrinsics(frame_set, now, self._recalibrates, is_doubtful)
         if self.monitors.rig.is_settled and is_doubtful:

@@ -134,9 +134,8 @@ class RecordingPlayer:
         for held in self._held.values():
             if n_before := bisect_right(held, from_ns, key=lambda message: message[0]):
                 yield from_s, *held[n_before - 1][1:]
-        for key, data, t_ns in read_messages(self.path, Counter()):
-            if t_ns >= from_ns:
-                yield (t_ns - self._start_ns) / 1e9, key, data
+        for key, data, t_ns in read_messages(self.path, Counter(), from_ns=from_ns):
+            yield (t_ns - self._start_ns) / 1e9, key, data
 
     def _start_pass(self, feed: Feed) -> "RecordingPass":
         feed.clear()

@@ -56,6 +56,20 @@ def test_writing_replaces_the_file_and_leaves_no_other_file(tmp_path: Path):
     assert stat.S_IMODE(path.stat().st_mode) == 0o644
 
 
+def test_writing_keeps_a_symbolic_link_and_permissions(tmp_path: Path):
+    """Configurations that are kept in a repository are linked to; those with secrets are their owner's."""
+    (tmp_path / "kept").mkdir()
+    path, link = tmp_path / "kept" / "rig.yaml", tmp_path / "rig.yaml"
+    path.write_text("old")
+    path.chmod(0o600)
+    link.symlink_to(path)
+    write_atomically(link, "new")
+    assert link.is_symlink()
+    assert path.read_text() == "new"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert list(path.parent.iterdir()) == [path]
+
+
 def test_writing_into_a_missing_folder_is_refused(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"rig\.yaml can't be written"):
         write_atomically(tmp_path / "no" / "rig.yaml", "")

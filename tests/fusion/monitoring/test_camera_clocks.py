@@ -39,6 +39,17 @@ def test_a_clock_that_jumps_is_reported_and_corrected(step_ms: float):
     assert corrected_ms == pytest.approx(-step_ms, abs=1.0)
 
 
+@pytest.mark.parametrize("lasts_s", [1.0, 0.3])
+def test_a_jump_that_ends_is_corrected_once_more(lasts_s: float):
+    """By 15 intervals, like 15 missing frames: only the correction shows that they would arrive before they were sent.
+    Where too few frames have told what is usual, the correction is dropped, and the robots show the clock."""
+    back_s = FAULT_S + lasts_s
+    outcome = fuse(LOAD, 5.0, {"cam1": lambda t_s: -0.5 * (FAULT_S <= t_s < back_s)})
+    assert outcome.wrong(FAULT_S + GRACE_S) == []
+    assert outcome.moves == []
+    assert len([t_s for t_s in outcome.used["cam1"] if back_s + 1.0 < t_s]) > 20
+
+
 @pytest.mark.parametrize("step_ms", [25, -25])
 def test_a_recording_without_arrival_times_shows_the_same(step_ms: float):
     """As `fusion run` reads from CSV and frames: each frame arrives at its own stamp. A step back is certain, one ahead

@@ -165,6 +165,19 @@ def test_several_passes_count_damage_once(tmp_path: Path):
     assert passes[0] == passes[2]
 
 
+@pytest.mark.parametrize("is_indexed", [True, False], ids=["with index", "without index"])
+def test_a_later_part_is_read_without_the_chunks_before(tmp_path: Path, is_indexed: bool):
+    """A page jumps in a recording of any length. Damage before the part shows that it was read: the index spares it."""
+    path = tmp_path / "a.mcap"
+    entries = write(path)
+    data, second = bytearray(path.read_bytes()), chunk_starts(path)[1]
+    data[second + 100] ^= 1
+    path.write_bytes(bytes(data) if is_indexed else bytes(data[: len(data) - 1]))
+    from_ns, faults = entries[150][2], Counter[str]()
+    assert list(read_messages(path, faults, from_ns=from_ns)) == entries[150:]
+    assert any("damaged" in reason for reason in faults) == (not is_indexed)
+
+
 def record(opcode: int, content: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(content)) + content
 

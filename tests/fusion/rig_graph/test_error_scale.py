@@ -44,13 +44,11 @@ def test_claims_grow_at_once_and_fall_slowly():
     def of_rig(scale: float) -> Verdict:
         return Verdict(None, (), fitted(None, (), 2, 0.0, scale), scale=scale)
 
-    assert next_scales(1.0, 1.0, verdict(16.0, 0, 1), True) == (1.0, 16.0)  # undecided: only claims grow
-    assert next_scales(1.0, 1.0, of_rig(16.0), False) == (1.0, 16.0)
-    assert next_scales(1.0, 1.0, of_rig(16.0), True) == (16.0, 16.0)
-    accepted, claimed = next_scales(16.0, 32.0, verdict(0.1), False)
+    assert next_scales(1.0, 1.0, verdict(16.0, 0, 1), True, 0.5) == (1.0, 16.0)  # undecided: only claims grow
+    assert next_scales(1.0, 1.0, of_rig(16.0), False, 0.5) == (1.0, 16.0)
+    assert next_scales(1.0, 1.0, of_rig(16.0), True, 0.5) == (16.0, 16.0)
+    accepted, claimed = next_scales(16.0, 32.0, verdict(0.1), False, 0.9)
     assert 8.0 < accepted < 16.0 < claimed < 32.0
-    assert next_scales(1.0, 16.0, verdict(0.1, 0, 1), True) == (
-        1.0,
-        16.0,
-    )  # cameras contradict each other still
-    assert next_scales(1.0, 1.0, verdict(0.1), False) == (1.0, 1.0)  # never below what the rig states
+    # Cameras contradict each other still.
+    assert next_scales(1.0, 16.0, verdict(0.1, 0, 1), True, 0.5) == (1.0, 16.0)
+    assert next_scales(1.0, 1.0, verdict(0.1), False, 0.5) == (1.0, 1.0)  # never below what the rig states

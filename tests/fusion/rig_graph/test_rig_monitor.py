@@ -12,6 +12,8 @@ import pytest
 from scipy.stats import chi2
 
 from camera_node.geometry.pose import rotation_from_vector
+from fusion.model.corrections import ExtrinsicsCorrection
+from fusion.model.frames import CalibratedFrame
 from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
@@ -73,16 +75,8 @@ def test_a_misplaced_marker_is_reported_of_its_robot_and_not_of_a_camera(off_m, 
     (x, y, z), *others = TRIANGLE.markers
     glued = msgspec.structs.replace(TRIANGLE, markers=((x, y + off_m, z), *others))
     arena = Arena({"a": glued}, {"a": around}, sigma_px=0.1)
-    tracker, synchronizer, corrections = (
-        Tracker(arena.cameras, {"a": TRIANGLE}),
-        FrameSynchronizer(PERIOD_NS),
-        [],
-    )
-    for frame in arena.frames(80):
-        synchronizer.add(frame)
-        for frame_set in synchronizer.take(frame.t_ns):
-            tracker.track(frame_set)
-            corrections += tracker.check_extrinsics(frame_set)
+    tracker = Tracker(arena.cameras, {"a": TRIANGLE})
+    corrections, _ = follow(tracker, arena.frames(80))
     assert corrections == []
     assert (list(tracker.geometry.misfits()) == ["a"]) == reported
     assert ("robot a" in caplog.text) == reported
@@ -96,12 +90,40 @@ def test_a_correct_camera_is_not_excluded(run_arena):
     )
     frames = [f for f in arena.frames(60) if not (f.camera == "cam2" and 0.5 < arena.seconds(f.t_ns) < 1.2)]
     frames = [black(f) if f.camera == "cam1" and arena.seconds(f.t_ns) > 1.2 else f for f in frames]
-    tracker, synchronizer = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS)
+    assert follow(Tracker(arena.cameras, ROBOTS), frames)[0] == []
+
+
+def test_of_four_cameras_one_of_which_is_silent_the_moved_one_is_found():
+    """Of three cameras that see robots, one that turned looks like the two others that turned together."""
+    before, after = moved(2.0, 0.0)
+    frames = [f for f in before.frames(90) if before.seconds(f.t_ns) < MOVE_S]
+    frames += [f for f in after.frames(90) if before.seconds(f.t_ns) >= MOVE_S]
+    corrections, states = follow(Tracker(before.cameras, ROBOTS), [f for f in frames if f.camera != "cam3"])
+    assert [(c.name, c.camera is None) for c in corrections] == [("cam1", True), ("cam1", False)]
+    assert states == ["tracked"] * len(ROBOTS)
+
+
+def test_robots_are_found_while_claims_count_large_errors_and_these_end():
+    """Cameras that contradicted each other agree again: claims stayed as large, and let no robot be found that would
+    have shown that."""
+    arena = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
+    tracker = Tracker(arena.cameras, ROBOTS)
+    tracker.cameras.scale_errors(1.0, 300.0)
+    assert follow(tracker, arena.frames(180)) == ([], ["tracked"] * len(ROBOTS))
+    assert tracker.cameras.error_scale == 1.0
+
+
+def follow(
+    tracker: Tracker, frames: list[CalibratedFrame]
+) -> tuple[list[ExtrinsicsCorrection], list[str | None]]:
+    """The corrections of cameras, and the states of all robots in the end."""
+    synchronizer, corrections, states = FrameSynchronizer(PERIOD_NS), [], []
     for frame in frames:
         synchronizer.add(frame)
         for frame_set in synchronizer.take(frame.t_ns):
-            tracker.track(frame_set)
-            assert tracker.check_extrinsics(frame_set) == ()
+            states = [pose.state for pose in tracker.track(frame_set).poses]
+            corrections += tracker.check_extrinsics(frame_set)
+    return corrections, states
 
 
 def test_a_process_that_judges_is_started_again_after_it_was_killed():
