@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from camera_node.foundation.logs import about
-from fusion.model.frames import CalibratedFrame
+from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.monitoring.stamp_check import StampCheck
 from fusion.rig_graph.clock_walk import Departure
 
@@ -90,12 +90,6 @@ class CameraClocks:
         """By camera."""
         return {name: clock.health for name, clock in self._clocks.items()}
 
-    def uncertain(self, speed_m_s: float) -> set[str]:
-        """Cameras whose time is not known well enough to locate robots at this speed, while two others are."""
-        corrected = ((name, clock) for name, clock in self._clocks.items() if clock.sigma_s)
-        found = {name for name, clock in corrected if clock.known_s * speed_m_s > MAX_MOTION_M}
-        return found if len(self._clocks) > len(found) + 1 else set()
-
     def inherit(self, old: "CameraClocks") -> None:
         """Continue with the clocks of the same cameras."""
         self._clocks = old._clocks
@@ -160,3 +154,10 @@ class CameraClocks:
         clock.correction_s, clock.since_ns = clock.at(t_ns) + departure.offset_s, t_ns
         clock.rate, clock.sigma_s = clock.rate + departure.rate, departure.sigma_s
         clock.rate_sigma = departure.rate_sigma
+
+
+def uncertain(frame_set: FrameSet, speed_m_s: float) -> set[str]:
+    """Cameras of a frame set whose time is not known well enough to locate robots at this speed, while that of two
+    others is: by what the frames state, so that a replay repeats it."""
+    found = {f.camera for f in frame_set.frames if f.clock_sigma_s * speed_m_s > MAX_MOTION_M}
+    return found if len({f.camera for f in frame_set.frames}) > len(found) + 1 else set()

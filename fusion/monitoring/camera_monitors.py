@@ -3,14 +3,12 @@
 
 from dataclasses import replace
 
-import numpy as np
-
 from calib.rig.camera import Camera
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import Snapshot
-from fusion.monitoring.camera_clocks import CameraClocks
+from fusion.monitoring.camera_clocks import CameraClocks, uncertain
 from fusion.monitoring.frame_consistency import FrameConsistency
 from fusion.monitoring.frozen_images import FrozenImages
 from fusion.rig_graph.rig_monitor import RigMonitor
@@ -25,7 +23,7 @@ class CameraMonitors:
     """
 
     def __init__(self, cameras: CameraArray, markers: MarkerTable) -> None:
-        self._cameras, self._speed_m_s, self._speed_ns = cameras, 0.0, 0
+        self._cameras = cameras
         self.clocks = CameraClocks(cameras.names)
         self.frozen = FrozenImages(cameras, markers)
         self.consistency = FrameConsistency(cameras, markers)
@@ -51,15 +49,12 @@ class CameraMonitors:
         """
         if sigma_s := self.clocks.observe(frame):
             self.rig.jump(frame.camera, sigma_s)
-        if now is not None and now.t_ns != self._speed_ns and now.tracked.any():
-            self._speed_ns = now.t_ns
-            self._speed_m_s = float(np.linalg.norm(now.states.v[now.tracked], axis=1).max())
         admitted = self.clocks.admit(frame)
         return None if admitted is None or self.frozen.is_frozen(admitted, now) else admitted
 
-    def used(self, frame_set: FrameSet) -> FrameSet:
-        """The frame set without the frames of moved cameras, and of those whose time is not known."""
-        excluded = self.rig.excluded | self.clocks.uncertain(self._speed_m_s)
+    def used(self, frame_set: FrameSet, speed_m_s: float) -> FrameSet:
+        """The frame set without the frames of moved cameras, and of those whose time is not known at this speed."""
+        excluded = self.rig.excluded | uncertain(frame_set, speed_m_s)
         if not excluded:
             return frame_set
         return replace(frame_set, frames=tuple(f for f in frame_set.frames if f.camera not in excluded))

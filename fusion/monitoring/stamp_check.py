@@ -17,7 +17,6 @@ MIN_JUMP_NS = 4_000_000  # of lags, which vary with the time of detection
 EARLY_SHARE = 0.25  # of the usual lag above the smallest, by which the next one may be smaller still
 MIN_IRREGULAR = 0.1  # of the interval between frames
 MISSED = 1, 2, 3  # intervals in the usual step between stamps, of a busy machine
-MAX_SWAPPED = 12  # intervals by which a frame may overtake another
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +84,10 @@ class StampCheck:
         )
 
     def _is_regular(self, t_ns: int, interval: float) -> bool:
-        """Whether a stamp follows the others by multiples of the usual interval, or is that of a swapped frame."""
+        """Whether a stamp follows the others by multiples of the usual interval, or fills a gap: the frame is late."""
         since = t_ns - max(self._stamps)
         is_new = min(abs(t_ns - stamp) for stamp in self._stamps) > MIN_IRREGULAR * interval
-        return _is_multiple(since, interval) and is_new and since > -(MAX_SWAPPED + 0.5) * interval
+        return _is_multiple(since, interval) and is_new and t_ns > min(self._stamps) - interval
 
 
 def _is_multiple(step: float, interval: float) -> bool:

@@ -68,6 +68,11 @@ class TrackTable:
         """(N,) robots that the last frame set shows and determines, if the rig is right: claims may be wider."""
         return self._seen & self.alive & ~self._is_uncertain(self.states.P)
 
+    @property
+    def speed_m_s(self) -> float:
+        """The speed of the fastest of the robots that the last frame set located."""
+        return float(np.linalg.norm(self.states.v[self.located], axis=1).max(initial=0.0))
+
     def unseen_s(self, t_ns: int) -> Array:
         """(N,) seconds until `t_ns` since the last frame set that observed each robot; 0 for those in acquisition."""
         return np.where(self._seen_ns > 0, np.maximum(t_ns - self._seen_ns, 0) * 1e-9, 0.0)

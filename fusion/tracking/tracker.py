@@ -140,7 +140,7 @@ class Tracker:
 
     def associate(self, associated: AssociatedFrames, frame_set: FrameSet) -> AssociatedFrames:
         """Assign detections of the frames that are not associated yet to the markers of tracked robots."""
-        frames = self.monitors.used(frame_set).frames
+        frames = self._used(frame_set).frames
         return replace(associated, association=associated.association.extended(frames))
 
     def associate_early(
@@ -156,13 +156,13 @@ class Tracker:
             early: the last return value.
         """
         associated = self.predict(frame_set.t_ns, early)
-        pending = associated.association.pending(self.monitors.used(frame_set).frames)
+        pending = associated.association.pending(self._used(frame_set).frames)
         return self.associate(associated, frame_set) if len(pending) >= WORTH * n_missing > 0 else associated
 
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
-        detections, all_assigned = self._collect(associated, self.monitors.used(frame_set))
+        detections, all_assigned = self._collect(associated, self._used(frame_set))
         assignments = self._update_states(associated, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
@@ -213,6 +213,10 @@ class Tracker:
         missing = np.flatnonzero(self.table.searched & ~self.table.alive).tolist()
         default = PAUSED if self.acquires_none else "not searched for yet"
         return {self.table.names[k]: self._reasons.get(k, default) for k in missing}
+
+    def _used(self, frame_set: FrameSet) -> FrameSet:
+        is_known = not any(frame.clock_sigma_s for frame in frame_set.frames)
+        return self.monitors.used(frame_set, 0.0 if is_known else self.table.speed_m_s)
 
     def _collect(
         self, associated: AssociatedFrames, frame_set: FrameSet

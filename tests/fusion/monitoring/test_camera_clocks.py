@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusion.model.frames import MAX_CLOCK_ERROR_S, clock_sigma_s
-from fusion.monitoring.camera_clocks import CameraClocks
+from fusion.model.frames import MAX_CLOCK_ERROR_S, FrameSet, clock_sigma_s
+from fusion.monitoring.camera_clocks import CameraClocks, uncertain
 from fusion.rig_graph.clock_walk import Departure
 from tests.benchmarks.fusion_load import START_NS, Load
 from tests.fusion.clock_faults import GRACE_S, Outcome, drift, fuse, inaccurate, step
@@ -109,6 +109,7 @@ def test_a_drift_that_is_not_measured_any_more_becomes_uncertain():
     """The correction grows by the rate, and its standard deviation by that of the rate."""
     clocks, rest_s = CameraClocks(("cam0", "cam1", "cam2")), 600
     clocks.correct(Departure(1, START_NS, -1e-3, -5e-5, 1e-4, 1e-5))
+    others = tuple(f for f in LOAD.frames(1 / LOAD.hz) if f.camera != "cam1")
     (frame,) = (f for f in LOAD.frames(1 / LOAD.hz) if f.camera == "cam1")
     later = replace(frame, t_ns=START_NS + rest_s * 10**9, received_ns=START_NS + rest_s * 10**9)
     clocks.observe(later)
@@ -116,8 +117,10 @@ def test_a_drift_that_is_not_measured_any_more_becomes_uncertain():
     assert admitted is not None
     assert (admitted.t_ns - later.t_ns) * 1e-9 == pytest.approx(-1e-3 - 5e-5 * rest_s, abs=1e-8)
     assert admitted.clock_sigma_s == pytest.approx(np.hypot(1e-4, 1e-5 * rest_s))
-    assert clocks.uncertain(1.0) == {"cam1"}
-    assert clocks.uncertain(0.5) == set()
+    frame_set = FrameSet(later.t_ns, (admitted, *others))
+    assert uncertain(frame_set, 1.0) == {"cam1"}
+    assert uncertain(frame_set, 0.5) == set()
+    assert uncertain(replace(frame_set, frames=(admitted, others[0])), 1.0) == set()
 
 
 @pytest.mark.parametrize(

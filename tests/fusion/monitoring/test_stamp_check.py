@@ -105,6 +105,15 @@ def test_a_late_frame_is_no_jump():
     )
 
 
+def test_a_frame_that_many_others_overtake_is_no_jump():
+    """It fills a gap between their stamps."""
+    for seed in range(N_RUNS):
+        rng, check = np.random.default_rng(seed), StampCheck()
+        lags_ms = 12 + rng.exponential(20, HISTORY + SINCE) + 500 * (np.arange(HISTORY + SINCE) == HISTORY)
+        frames = [(t + round(1e6 * lag), t) for t, lag in zip(regular(), lags_ms, strict=True)]
+        assert not any(check.add(t, received_ns) for received_ns, t in sorted(frames))
+
+
 @pytest.mark.parametrize("taken", [0.8, 0.4], ids=["some frames are skipped", "most frames are skipped"])
 def test_the_end_of_a_load_is_no_jump(taken: float):
     """A busy machine takes some frames and sends them late; when the load ends, frames arrive sooner than any before,
