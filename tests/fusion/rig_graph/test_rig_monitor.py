@@ -113,9 +113,7 @@ def test_robots_are_found_while_claims_count_large_errors_and_these_end():
     assert tracker.cameras.error_scale == 1.0
 
 
-def follow(
-    tracker: Tracker, frames: list[CalibratedFrame]
-) -> tuple[list[ExtrinsicsCorrection], list[str | None]]:
+def follow(tracker: Tracker, frames: list[CalibratedFrame]) -> tuple[list[ExtrinsicsCorrection], list[str]]:
     """The corrections of cameras, and the states of all robots in the end."""
     synchronizer, corrections, states = FrameSynchronizer(PERIOD_NS), [], []
     for frame in frames:
