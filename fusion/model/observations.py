@@ -38,6 +38,8 @@ from fusion.model.undistortion import (
     table_of,
 )
 
+MAX_ERROR_PX = 3.0  # of a camera, to assign its detections: gates of three times as much reach other roundels
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposures:
@@ -122,17 +124,17 @@ class CameraArray:
         R_cam_world: (C, 3, 3).
         centres: (C, 3) centres of projection, world frame.
         focal: (C,) mean focal lengths, pixels.
-        covariance: (8 C, 8 C) of the errors of the cameras that claims count; see `calib.rig.camera_errors`.
-        error_px: (C,) what accepted errors displace in the images, RMS of a coordinate: by these, detections are
-            weighed, associated and searched.
-        error_scale: factor of the standard deviations that the rig states, in `covariance`.
+        covariance: (8 C, 8 C) of the errors of the cameras, which claims contain; see `calib.rig.camera_errors`.
+        error_px: (C,) what these errors displace in the images, RMS of a coordinate, at most `MAX_ERROR_PX`: by these,
+            detections are weighed, associated and searched.
+        error_scale: factor of the standard deviations that the rig states.
         revision: counts the changes of camera poses and of their errors.
     """
 
     def __init__(self, cameras: dict[str, Camera], error_scale: float = 1.0) -> None:
         self.names = tuple(cameras)
         self.index = {name: k for k, name in enumerate(cameras)}
-        self._cameras, self.error_scale, self._accepted_scale = dict(cameras), error_scale, error_scale
+        self._cameras, self.error_scale = dict(cameras), error_scale
         self.revision = 0
         for camera in cameras.values():
             table_of(camera)  # so that the first frame does not wait for it
@@ -158,11 +160,10 @@ class CameraArray:
             self.revision += 1
             self._update()
 
-    def scale_errors(self, accepted: float, claimed: float) -> None:
-        """Count the errors that the rig states this many times as large: those that are accepted, and those that claims
-        contain while nothing is decided. With these, no robot might be found any more that decides."""
-        if (accepted, claimed) != (self._accepted_scale, self.error_scale):
-            self._accepted_scale, self.error_scale = accepted, claimed
+    def scale_errors(self, scale: float) -> None:
+        """Count the errors that the rig states this many times as large."""
+        if scale != self.error_scale:
+            self.error_scale = scale
             self.revision += 1
             self._update()
 
@@ -172,9 +173,8 @@ class CameraArray:
         self.R_cam_world = np.ascontiguousarray(T[:, :3, :3].transpose(0, 2, 1))
         self.centres = np.ascontiguousarray(T[:, :3, 3])
         self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
-        stated = error_covariance(list(cameras))
-        self.covariance = self.error_scale**2 * stated
-        self.error_px = self._accepted_scale * image_errors(list(cameras), stated)
+        self.covariance = self.error_scale**2 * error_covariance(list(cameras))
+        self.error_px = np.minimum(image_errors(list(cameras), self.covariance), MAX_ERROR_PX)
 
     def frame_poses(self, states: States, exposures: Exposures) -> _core.FramePoses:
         """The poses of all bodies at the capture times of all frames."""

@@ -98,31 +98,33 @@ class CameraClocks:
         """Forget the clock of a camera that has another calibration."""
         self._clocks[name] = _Clock(StampCheck())
 
-    def observe(self, frame: CalibratedFrame) -> float:
-        """Take the stamp and the arrival of the next frame of a camera; the standard deviation of its clock, s, if its
-        stamps jumped, or may have, else 0."""
+    def observe(self, frame: CalibratedFrame) -> tuple[float, float]:
+        """Take the stamp and the arrival of the next frame of a camera; the standard deviations of its clock, s, and of
+        its rate, if its stamps jumped, or may have, else 0."""
         name, clock = frame.camera, self._clocks[frame.camera]
         clock.now_ns = frame.t_ns
         least_lag_s = clock.at(frame.t_ns) - CERTAIN * clock.known_s
         jump = clock.check.add(frame.t_ns, frame.received_ns, 1e9 * least_lag_s)
         if jump is None:
             return self._refute(frame)
-        sigma_s = 1e-9 * jump.sigma_ns
+        # The clock was set, or is another one: its rate may have ended.
+        sigma_s, rate_sigma = 1e-9 * jump.sigma_ns, abs(clock.rate)
+        clock.rate_sigma = math.hypot(clock.rate_sigma, rate_sigma)
         if not jump.ahead_ns:
             clock.sigma_s = math.hypot(clock.sigma_s, sigma_s)
-            return sigma_s
+            return sigma_s, rate_sigma
         clock.correction_s, clock.since_ns = clock.at(frame.t_ns) - 1e-9 * jump.ahead_ns, frame.t_ns
-        clock.reported_s, clock.sigma_s = clock.correction_s, sigma_s
+        clock.reported_s, clock.sigma_s, clock.rate = clock.correction_s, sigma_s, 0.0
         message = "camera %s: its stamps jumped by %.0f ms; they are corrected, now by %.1f ms"
         log.warning(message, name, 1e-6 * jump.ahead_ns, 1e3 * clock.at(frame.t_ns), extra=about(name))
-        return sigma_s
+        return sigma_s, rate_sigma
 
-    def _refute(self, frame: CalibratedFrame) -> float:
+    def _refute(self, frame: CalibratedFrame) -> tuple[float, float]:
         """Forget a correction by which a frame would arrive long before it was sent: the stamps jumped back, unnoticed
-        so soon after the jump before. The standard deviation of the clock, s, is the correction; 0 if there is none."""
-        wrong_s = self._clocks[frame.camera].at(frame.t_ns)
+        so soon after the jump before. The standard deviation of the clock is the correction."""
+        wrong_s, rate = self._clocks[frame.camera].at(frame.t_ns), self._clocks[frame.camera].rate
         if frame.t_ns + 1e9 * wrong_s <= frame.received_ns + MAX_AHEAD_NS or not wrong_s:
-            return 0.0
+            return 0.0, 0.0
         self.reset(frame.camera)
         clock = self._clocks[frame.camera]
         clock.now_ns, clock.sigma_s = frame.t_ns, abs(wrong_s)
@@ -131,7 +133,7 @@ class CameraClocks:
             *(frame.camera, 1e3 * wrong_s),
             extra=about(frame.camera),
         )
-        return abs(wrong_s)
+        return abs(wrong_s), abs(rate)
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None if that time is in the future."""

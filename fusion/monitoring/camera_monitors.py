@@ -47,8 +47,9 @@ class CameraMonitors:
             frame: the next one of its camera.
             now: the robots at the last frame set; None before the first.
         """
-        if sigma_s := self.clocks.observe(frame):
-            self.rig.jump(frame.camera, sigma_s)
+        sigmas = self.clocks.observe(frame)
+        if any(sigmas):
+            self.rig.jump(frame.camera, *sigmas)
         admitted = self.clocks.admit(frame)
         return None if admitted is None or self.frozen.is_frozen(admitted, now) else admitted
 

@@ -65,9 +65,12 @@ class ClockWalk:
         self.x[others], self.P[others], self.P[:, others] = 0.0, 0.0, 0.0
         self.P[others, others] = self._most[others] ** 2
 
-    def jump(self, camera: int, sigma_s: float) -> None:
-        """The stamps of a camera were corrected by a jump with this standard deviation, or may have jumped so far."""
+    def jump(self, camera: int, sigma_s: float, rate_sigma: float) -> None:
+        """The stamps of a camera were corrected by a jump with this standard deviation, or may have jumped so far.
+        Their rate was corrected until then by as much as `rate_sigma`."""
         self.P[self.offsets[camera], self.offsets[camera]] += sigma_s**2
+        self.P[self.rates[camera], self.rates[camera]] += rate_sigma**2
+        self._most[self.rates[camera]] = max(RATE_SIGMA, rate_sigma)
         self._depart(camera)
 
     def _depart(self, camera: int) -> None:

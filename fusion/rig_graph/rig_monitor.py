@@ -118,7 +118,7 @@ class RigMonitor:
         self.inherit_poses(old)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
         self._scale, self._doubted = old._scale, old._doubted
-        self._cameras.scale_errors(old._scale, old._cameras.error_scale)
+        self._cameras.scale_errors(old._cameras.error_scale)
 
     def inherit_poses(self, old: "RigMonitor") -> None:
         """The poses that another monitor of the same cameras knows, and those that a user confirmed."""
@@ -165,9 +165,9 @@ class RigMonitor:
             self._keyframes.retime(self._cameras.names[departure.camera], departure.at)
         return found
 
-    def jump(self, name: str, sigma_s: float) -> None:
-        """The stamps of a camera jumped and are corrected with this standard deviation, or may have jumped so far."""
-        self._walk.jump(self._cameras.index[name], sigma_s)
+    def jump(self, name: str, sigma_s: float, rate_sigma: float) -> None:
+        """The stamps of a camera jumped, or may have; see `ClockWalk.jump`."""
+        self._walk.jump(self._cameras.index[name], sigma_s, rate_sigma)
         self._forget()
 
     def check(
@@ -235,7 +235,7 @@ class RigMonitor:
             self._scale, claimed = scales
             if self._scale == claimed:
                 self._doubted.clear()
-            self._cameras.scale_errors(claimed if verdict.is_of_rig else self._scale, claimed)
+            self._cameras.scale_errors(claimed)
         if names:
             self._size_m = _claim_m(window) * verdict.misfit**0.5
         self._note_undecided(names if self._n_undecided >= CONFIRMED else self._underrated())
@@ -276,7 +276,7 @@ class RigMonitor:
             self._clocks = self._clocks[-1:]
         k = verdict.cameras[0] if verdict.cause == "clock" else -1
         if k >= 0 and len(self._clocks) >= CONFIRMED:
-            self._walk.jump(k, abs(float(verdict.fit.errors[k, CAUSES["clock"]][0])))
+            self._walk.jump(k, abs(float(verdict.fit.errors[k, CAUSES["clock"]][0])), 0.0)
         elif verdict.cameras or self.excluded or self.contradicting:
             return
         if measured is None:
@@ -341,7 +341,7 @@ class RigMonitor:
         self._walk.forget_poses()
         self._is_contradicted, self._n_undecided = False, 0
         self._scale = 1.0
-        self._cameras.scale_errors(1.0, 1.0)
+        self._cameras.scale_errors(1.0)
         self._doubted.clear()
         self._clocks.clear()
         self._note_undecided(())

@@ -105,6 +105,15 @@ def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, du
     assert outcome.worst_m(FAULT_S) < 0.007  # 4.6 mm without a drift
 
 
+def test_a_drift_that_ends_is_not_corrected_any_more():
+    """The clock is set, so its rate may have ended: kept, it made poses wrong for 15 s."""
+    load, set_s = replace(LOAD, robots=6, speed_m_s=0.5), FAULT_S + 3.0
+    outcome = fuse(load, 8.5, {"cam1": lambda t_s: 5e-3 * (t_s - FAULT_S) * (FAULT_S <= t_s < set_s)})
+    assert outcome.wrong(FAULT_S + GRACE_S) == []
+    assert outcome.moves == []
+    assert outcome.worst_m(set_s + 1.0) < 0.005
+
+
 def test_a_drift_that_is_not_measured_any_more_becomes_uncertain():
     """The correction grows by the rate, and its standard deviation by that of the rate."""
     clocks, rest_s = CameraClocks(("cam0", "cam1", "cam2")), 600

@@ -55,7 +55,7 @@ def test_two_clocks_do_not_show_which_one_departs():
 
 def test_a_jump_that_is_known_to_be_possible_is_of_that_camera():
     walk = ClockWalk(4)
-    walk.jump(2, 0.02)
+    walk.jump(2, 0.02, 0.0)
     walk.update(10**9, *about_offsets(np.array([0.0, 0.0, 0.025, 0.0])))
     (found,) = walk.take_departures()
     assert found.camera == 2

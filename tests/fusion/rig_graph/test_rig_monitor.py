@@ -108,7 +108,7 @@ def test_robots_are_found_while_claims_count_large_errors_and_these_end():
     have shown that."""
     arena = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
     tracker = Tracker(arena.cameras, ROBOTS)
-    tracker.cameras.scale_errors(1.0, 300.0)
+    tracker.cameras.scale_errors(300.0)
     assert follow(tracker, arena.frames(180)) == ([], ["tracked"] * len(ROBOTS))
     assert tracker.cameras.error_scale == 1.0
 
