@@ -144,7 +144,7 @@ class _Signal:
             rows = rows[np.diff(t_s[rows], prepend=-np.inf) > 0]
             if len(rows) > 1:
                 tracks[number] = MarkerTrack.of(t_s[rows], xy[rows])
-        period_s = frames.select_camera(camera).period_s()
+        period_s = frames.select(frames.camera == camera).period_s()
         return cls(tracks, Timing(period_s)) if tracks and period_s else None
 
     @property

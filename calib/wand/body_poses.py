@@ -25,6 +25,7 @@ from calib.rig.coverage import spread_evenly
 from calib.rig.estimation import MARGIN, STEPS
 from calib.wand.detections import MarkerTrack, WandDetections
 from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.foundation.columns import Columns
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_from_vector, skew, vector_from_rotation
@@ -49,8 +50,8 @@ NO_FIT = (
 DETECTION_PX = 0.3  # noise of a detection, where two poses of a camera are compared
 
 
-@dataclass(frozen=True, slots=True)
-class _Views:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Views(Columns):
     """Images of markers by placed cameras, at several instants.
 
     Attributes:
@@ -62,10 +63,6 @@ class _Views:
     camera: Index
     marker: Index
     xy: Array
-
-    def select(self, rows: Index) -> "_Views":
-        """The rows of these indices."""
-        return _Views(self.instant[rows], self.camera[rows], self.marker[rows], self.xy[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,9 +195,7 @@ class BodyLocator:
             xy = np.array([track.interpolate(t_s - self.offset_s[k], self.gap_s) for track in self.tracks[k]])
             marker, instant = _thin(*np.nonzero(np.isfinite(xy[..., 0])))
             parts.append(_Views(instant, np.full(len(marker), k), marker, xy[marker, instant]))
-        views = _Views(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in _Views.__slots__)
-        )
+        views = parts[0].joined(*parts[1:])
         return views.select(np.lexsort((views.marker, views.camera, views.instant)))
 
     def _solve(self, views: _Views) -> tuple[Array, Index]:

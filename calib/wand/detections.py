@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,10 @@ from calib.errors import CalibrationError
 from calib.rig.camera import Camera
 from calib.wand.trajectory import hermite
 from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.columns import Columns
 from camera_node.geometry.body import Body
 from camera_node.geometry.codes import PLAIN
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.outline import RawEllipses
 from camera_node.protocol.messages import Detections
 
 MAX_CLOCK_ERROR_S = 1.0  # bound for a timestamp without a clock error: above any difference of camera clocks
@@ -46,15 +45,8 @@ MIN_COINCIDENT = 0.8
 SAME_S = 1e-6  # stamps closer than this are equal: they are whole nanoseconds, here as seconds
 
 
-class Ellipses(RawEllipses, Protocol):
-    """Detections with ellipses and their cameras, as columns (see `WandDetections`)."""
-
-    @property
-    def camera(self) -> Index: ...
-
-
-@dataclass(frozen=True, slots=True)
-class FrameTable:
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameTable(Columns):
     """All frames of a recording, sorted by camera, then by time.
 
     Attributes:
@@ -67,51 +59,49 @@ class FrameTable:
     t_s: Array
     readout_s: Array
 
-    def select_camera(self, camera: int) -> "FrameTable":
-        """Return the frames of one camera."""
-        mine = self.camera == camera
-        return FrameTable(self.camera[mine], self.t_s[mine], self.readout_s[mine])
-
     def period_s(self) -> float:
         """Return the median time between consecutive frames of a camera, seconds; 0 if no camera has two."""
         steps = np.diff(self.t_s)[(np.diff(self.camera) == 0) & (np.diff(self.t_s) > 0)]
         return float(np.median(steps)) if len(steps) else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class WandDetections:
-    """Detections, sorted by frame.
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerImages(Columns):
+    """Images of the wand's markers.
 
     Attributes:
-        camera, frame: (n,) indices of the camera and of the frame.
+        camera: (n,) index of the camera.
+        label: (n,) marker of the wand, -1 if unknown.
         t_s: (n,) timestamp of the frame, seconds; of the detection's row where the readout time is given.
         image_row: (n,) height in the image, -1/2 to 1/2 (`Lens.image_row`).
         stamp_sigma_s: (n,) standard deviation of the timestamp, without the offset common to the camera's timestamps.
-        label: (n,) marker of the wand, -1 if unknown.
         uv: (n, 2) centre of the ellipse, raw pixels.
         cov: (n, 2, 2) covariance of the centre, square pixels.
         axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN if unknown.
-        xy: (n, 2) undistorted image plane coordinates of `uv`.
     """
 
     camera: Index
-    frame: Index
+    label: Index
     t_s: Array
     image_row: Array
     stamp_sigma_s: Array
-    label: Index
     uv: Array
     cov: Array
     axes_px: Array
     angle_rad: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WandDetections(MarkerImages):
+    """Detections, sorted by frame.
+
+    Attributes:
+        frame: (n,) index of the frame.
+        xy: (n, 2) undistorted image plane coordinates of `uv`.
+    """
+
+    frame: Index
     xy: Array
-
-    def __len__(self) -> int:
-        return len(self.uv)
-
-    def select(self, rows: NDArray) -> "WandDetections":
-        """Return the rows that a mask or an index array selects."""
-        return WandDetections(*(getattr(self, name)[rows] for name in self.__slots__))
 
     def rays(self) -> Array:
         """Return (n, 3) unit viewing rays, camera frames."""
@@ -151,15 +141,15 @@ def gather(
     image_row = image_rows(lenses, camera[frame], uv)
     detections = WandDetections(
         camera[frame],
-        frame,
+        label,
         frames.t_s[frame] + readout_s[frame] * image_row,
         image_row,
         stamp_sigmas(camera, 1e-6 * np.array(bound_us))[frame],
-        label,
         uv,
         cov[:, [0, 1, 1, 2]].reshape(-1, 2, 2),
         axes_px,
         angle_rad[:, 0],
+        frame,
         normalise(lenses, camera[frame], uv),
     )
     usable = np.isfinite(detections.xy).all(axis=1) & (detections.label != FOREIGN)
@@ -203,7 +193,7 @@ def _read_column(data: Sequence[bytes], dtype: str, width: int) -> Array:
     return np.frombuffer(b"".join(data), dtype).reshape(-1, width).astype(float)
 
 
-def ranges(lenses: Sequence[Lens], detections: Ellipses, diameter_m: float) -> Array:
+def ranges(lenses: Sequence[Lens], detections: MarkerImages, diameter_m: float) -> Array:
     """Return (n,) distances of discs from the cameras, metres, from the angle that their major axis subtends.
 
     A disc of diameter d at distance r and any slant subtends the angle 2 atan(d / 2r) along its major axis. NaN where
@@ -399,9 +389,7 @@ class WandRecording:
             self,
             names=names,
             lenses=lenses,
-            frames=FrameTable(
-                number[self.frames.camera[mine]], self.frames.t_s[mine], self.frames.readout_s[mine]
-            ),
+            frames=replace(self.frames, camera=number[self.frames.camera]).select(mine),
             detections=replace(detections, frame=(np.cumsum(mine) - 1)[detections.frame]),
             tracks=tracks,
             left_out=left_out,

@@ -18,6 +18,7 @@ from calib.rig.camera import span_dimension
 from calib.rig.estimation import MARGIN
 from calib.wand.detections import WandDetections, ranges
 from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.foundation.columns import Columns
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 
@@ -130,8 +131,8 @@ class _Candidates:
     triple: Index
 
 
-@dataclass(frozen=True, slots=True)
-class _Hypotheses:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hypotheses(Columns):
     """Candidates that passed the test.
 
     Attributes:
@@ -191,12 +192,11 @@ class _PoseSearch:
         order = np.argsort(self.along, kind="stable").tolist()
         solve: Callable[[Index, Index, Index], _Candidates]
         solve = self._solve_line if span_dimension(self.wand.points) < 2 else self._solve_p3p
-        found = [
+        first, *others = (
             self._test(rows, markers, solve(markers, rows, triples))
             for markers in map(np.array, combinations(order, 3))
-        ]
-        columns = _Hypotheses.__slots__
-        return _Hypotheses(*(np.concatenate([getattr(part, name) for part in found]) for name in columns))
+        )
+        return first.joined(*others)
 
     def _solve_line(self, markers: Index, rows: Index, triples: Index) -> _Candidates:
         """Return poses of a straight wand from triples of collinear detections in the order of the markers."""

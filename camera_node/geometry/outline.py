@@ -17,8 +17,6 @@ With radial distortion k1 these are 3 k1 r^2 x for a disc of radius r at x in th
 from the image's centre, and always towards it or away from it, so it does not average out.
 """
 
-from typing import Protocol
-
 import numpy as np
 
 from camera_node import _core
@@ -26,17 +24,6 @@ from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 
 MAX_SHIFT = 0.3  # radii; where it is larger, the second derivatives do not describe the image
-
-
-class RawEllipses(Protocol):
-    """N detected ellipses, raw pixels: centres (N, 2), full axes (N, 2) and directions (N,), NaN where unknown."""
-
-    @property
-    def uv(self) -> Array: ...
-    @property
-    def axes_px(self) -> Array: ...
-    @property
-    def angle_rad(self) -> Array: ...
 
 
 def disc_pictures(positions: Array, normals: Array) -> tuple[Array, Array, Array]:

@@ -15,6 +15,8 @@ from itertools import combinations
 from typing import Any, cast
 
 import numpy as np
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf
 
 from calib.rig.camera import PER_CAMERA, READOUT
 from calib.rig.estimation import CAUCHY_SCALE, GROSS, coordinate_sigma
@@ -55,7 +57,6 @@ ANCHOR = np.array([1e8] * 6 + [1e10, 1e13] + [0.0] * (PER_CAMERA - READOUT[0]))
 # Damping of a knot's position and velocity, of the information in the best observed direction of each: a knot that only
 # one camera observed is not determined along its viewing ray.
 MIN_RELATIVE_INFORMATION = 2.0**-22
-GROUP_SIZE = 24  # scalars in one block of the factorization, at least: fewer, larger products are faster
 
 
 def optimize_robustly(problem: Problem, observations: WandObservations, start: State) -> State:
@@ -455,58 +456,37 @@ class BlockTridiagonal:
         Raises:
             LinAlgError: it is not positive definite.
         """
-        h = self.diagonal.shape[1]
-        groups, links = self._group(-(-GROUP_SIZE // h))
-        for k, link in enumerate(links):
-            # The Cholesky factor of what remains of this group after the elimination of those before.
-            groups[k] = np.linalg.cholesky(groups[k])
-            if k + 1 < len(groups):
-                by_link = np.linalg.solve(groups[k, -h:, -h:], link.T)
-                groups[k + 1, :h, :h] -= by_link.T @ by_link
-        root = np.linalg.inv(groups)
+        blocks = self.diagonal.copy()
+        for k, link in enumerate(self.below):
+            # The Cholesky factor of what remains of this block after the elimination of those before.
+            by_link = dtrsm(1.0, dpotrf(blocks[k], lower=1)[0], link.T, lower=1)
+            blocks[k + 1] -= by_link.T @ by_link
+        root = np.linalg.inv(np.linalg.cholesky(blocks))
         inverse = root.mT @ root
-        return BlockFactors(inverse, links[:-1] @ inverse[:-1, -h:], len(self.diagonal))
-
-    def _group(self, count: int) -> tuple[Array, Array]:
-        """The diagonal in groups (N, m, m) of `count` blocks, padded with ones at the end, of which the part above the
-        diagonal is not filled, and the block (N, h, h) that links each to the next; 0 for the last."""
-        blocks, h = self.diagonal.shape[:2]
-        total = -(-blocks // count)
-        diagonal, below = np.tile(np.eye(h), (total * count, 1, 1)), np.zeros((total * count, h, h))
-        diagonal[:blocks], below[: blocks - 1] = self.diagonal, self.below
-        groups = np.zeros((total, count, h, count, h))
-        for k in range(count):
-            groups[:, k, :, k] = diagonal[k::count]
-            if k:
-                groups[:, k, :, k - 1] = below[k - 1 :: count]
-        return groups.reshape(total, count * h, count * h), below[count - 1 :: count]
+        return BlockFactors(inverse, self.below @ inverse[:-1])
 
 
 @dataclass(frozen=True, slots=True)
 class BlockFactors:
-    """L D L^T of a matrix, in N groups of m rows, padded with ones.
+    """L D L^T of a matrix.
 
     Attributes:
-        inverse: (N, m, m) of the blocks of D.
-        below: (N - 1, h, m) the first h rows of the blocks of L below its diagonal; the others are 0.
-        blocks: number K of the matrix's own blocks, of h rows.
+        inverse: (K, h, h) of the blocks of D.
+        below: (K - 1, h, h) the blocks of L below its diagonal.
     """
 
     inverse: Array
     below: Array
-    blocks: int
 
     def solve(self, right: Array) -> Array:
         """The solution for right-hand sides (K, h, n), of the same shape."""
-        h, n = right.shape[1:]
-        x = np.zeros((*self.inverse.shape[:2], n))
-        x.reshape(-1, h, n)[: self.blocks] = right
+        x = right.copy()
         for k, below in enumerate(self.below):
-            x[k + 1, :h] -= below @ x[k]
+            x[k + 1] -= below @ x[k]
         x = self.inverse @ x
         for k in reversed(range(len(self.below))):
-            x[k] -= self.below[k].T @ x[k + 1, :h]
-        return x.reshape(-1, h, n)[: self.blocks]
+            x[k] -= self.below[k].T @ x[k + 1]
+        return x
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,12 +3,12 @@
 
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import FLAT, LENS, PER_CAMERA, POSE, with_distortion
+from calib.wand.detections import MarkerImages
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
@@ -22,51 +22,17 @@ SLEWED_DRIFT, CRYSTAL_DRIFT = 5e-4, 3e-5
 SHAKE_ITERATIONS = 4  # that satisfy several lengths together
 
 
-@dataclass(frozen=True, slots=True)
-class WandObservations:
-    """Observed marker centres, one row each.
+@dataclass(frozen=True, slots=True, eq=False)
+class WandObservations(MarkerImages):
+    """Observed marker centres: `uv` are the discs' own.
 
     Attributes:
         row: (n,) index of the detection in the labeled recording.
-        camera: (n,) index of the camera.
         knot: (n,) index of the frame set, and of its knot.
-        label: (n,) marker of the wand.
-        t_s, stamp_sigma_s: (n,) stamp, seconds, and its standard deviation beside the offset of the camera's clock.
-        image_row: (n,) height in the image, -1/2 to 1/2 (`Lens.image_row`).
-        uv: (n, 2) raw pixels of the disc's own centre.
-        cov: (n, 2, 2) covariance of `uv`, square pixels.
-        axes_px, angle_rad: (n, 2) full axes and (n,) direction of the ellipse; NaN where unknown.
     """
 
     row: Index
-    camera: Index
     knot: Index
-    label: Index
-    t_s: Array
-    stamp_sigma_s: Array
-    image_row: Array
-    uv: Array
-    cov: Array
-    axes_px: Array
-    angle_rad: Array
-
-    def __len__(self) -> int:
-        return len(self.uv)
-
-    def select(self, rows: NDArray) -> "WandObservations":
-        """The rows that a mask or an index array selects."""
-        return WandObservations(*(getattr(self, name)[rows] for name in self.__slots__))
-
-
-class TimedRows(Protocol):
-    """Observations or detections with their cameras, stamps and heights in the image, (n,) each."""
-
-    @property
-    def camera(self) -> Index: ...
-    @property
-    def t_s(self) -> Array: ...
-    @property
-    def image_row(self) -> Array: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +139,7 @@ class State:
         motion = self.motion + motion_step.reshape(self.motion.shape)
         return State(cameras, clocks, lenses, motion, self.points)
 
-    def true_times(self, observations: "TimedRows", middle_s: float) -> Array:
+    def true_times(self, observations: MarkerImages, middle_s: float) -> Array:
         """(n,) true capture times: stamp + offset + drift (stamp - `middle_s`) + readout time x height in the image."""
         offset, drift, readout = self.clocks[observations.camera].T
         t_s = observations.t_s

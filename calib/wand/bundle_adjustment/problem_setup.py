@@ -8,7 +8,7 @@ and constrain the cameras where the wand is not waved.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -30,6 +30,7 @@ from calib.wand.bundle_adjustment.problem import (
 from calib.wand.bundle_adjustment.residuals import start_points
 from calib.wand.detections import (
     SAME_S,
+    MarkerImages,
     MarkerTrack,
     WandDetections,
     WandRecording,
@@ -186,20 +187,10 @@ def _middle_times(t_s: Array, knot: Index) -> Array:
 
 
 def _observations(recording: WandRecording, rows: Index, knot: Index) -> WandObservations:
-    detections = recording.detections.select(rows)
-    return WandObservations(
-        row=rows,
-        camera=detections.camera,
-        knot=knot,
-        label=detections.label,
-        t_s=detections.t_s,
-        stamp_sigma_s=detections.stamp_sigma_s,
-        image_row=detections.image_row,
-        uv=detections.uv,
-        cov=detections.cov + MIN_SIGMA_PX**2 * np.eye(2),
-        axes_px=detections.axes_px,
-        angle_rad=detections.angle_rad,
-    )
+    chosen = recording.detections.select(rows)
+    columns = {field.name: getattr(chosen, field.name) for field in fields(MarkerImages)}
+    columns["cov"] = chosen.cov + MIN_SIGMA_PX**2 * np.eye(2)
+    return WandObservations(**columns, row=rows, knot=knot)
 
 
 def group_frames(t_s: Array, camera: Index, spread_s: float, least: int = 2) -> Index:
