@@ -131,7 +131,7 @@ def test_a_full_disk_changes_no_file(tmp_path: Path, arena: Arena):
 def test_check_judges_a_rig_and_writes_only_to_the_given_files(tmp_path: Path, arena: Arena):
     """By the recording that it was calibrated from: poses and halves agree, and the copy of the rig has the figures."""
     write_observations(
-        tmp_path / "observations.csv", record(arena, 16.0, sigma_px=0.1, numbered=True, free_running=False)
+        tmp_path / "observations.csv", record(arena, 10.0, sigma_px=0.1, numbered=True, free_running=False)
     )
     observations = ("--observations", tmp_path / "observations.csv")
     assert calib("wand", *wand_options(tmp_path), *observations).returncode == 0

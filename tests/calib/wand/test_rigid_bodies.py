@@ -87,7 +87,7 @@ def test_eight_cameras_around_a_cube_are_placed_with_an_honest_covariance(sides:
     arena, squared, degrees = ring(8, wand=CUBE), 0.0, 0
     for seed in range(seeds):
         rig = roughly(arena.intrinsics, CAREFUL, with_sigma=True, seed=seed)
-        result = calibrate(rig, CUBE, wave(arena, sides, 60, seed), synchronous=True)
+        result = calibrate(rig, CUBE, wave(arena, sides, 40, seed), synchronous=True)
         assert len(result.rig.placed()) == 8
         assert camera_errors(result.rig, arena.truth)[0].max() < 0.02
         error, more = joint_error(result, arena.truth)
@@ -114,7 +114,7 @@ def test_one_frame_of_one_side_leaves_a_camera_out_where_it_allows_two_poses():
 
 def test_free_running_cameras_are_joined_by_the_body_too():
     arena = ring(4, wand=CUBE)
-    messages = wave(arena, 1, 150, 0, period_ns=50_000_000, phase=0.24)
+    messages = wave(arena, 1, 80, 0, period_ns=50_000_000, phase=0.24)
     result = calibrate(arena.intrinsics, CUBE, messages)
     assert len(result.rig.placed()) == 4
     assert camera_errors(result.rig, arena.truth)[0].max() < 0.03

@@ -19,13 +19,13 @@ READOUT_MS = 30.0
 
 
 def waved(
-    readout_ms: float, offset_ms: float = 50.0, free_running: bool = True, seed: int = 5
+    readout_ms: float, offset_ms: float = 50.0, free_running: bool = True, seed: int = 5, seconds: float = 10
 ) -> SimulatedRecording:
-    """Ten seconds before three cameras."""
+    """Three cameras."""
     return record(
         WandScenario(
             cameras=3,
-            seconds=10,
+            seconds=seconds,
             rate_hz=30,
             sigma_px=0.2,
             outliers=0.02,
@@ -97,7 +97,7 @@ def test_estimated_readout_times_and_clocks_are_unbiased():
 
 def test_a_given_readout_time_is_used():
     """By the cameras' messages; synchronous cameras with rolling shutters still see the wand at different times."""
-    recorded = waved(READOUT_MS, offset_ms=0.0, free_running=False)
+    recorded = waved(READOUT_MS, offset_ms=0.0, free_running=False, seconds=5)
     messages = [msgspec.structs.replace(m, readout_us=1e3 * READOUT_MS) for m in recorded.messages]
     result = calibrate(recorded.intrinsics, STICK, messages, synchronous=True)
     assert "captured one after another" in result.report.timing
@@ -111,7 +111,7 @@ def test_a_given_readout_time_is_used():
 
 
 def test_a_global_shutter_has_no_readout_time():
-    recorded = waved(0.0)
+    recorded = waved(0.0, seconds=5)
     result = calibrate(recorded.intrinsics, STICK, recorded.messages)
     assert not result.readout_ms.any()
     assert all(camera.readout_us is None for camera in result.rig.cameras.values())

@@ -20,7 +20,7 @@ from tests.calib.recordings import record as record_wave
 from tests.calib.synthetic import STICK, Arena, camera_errors, ring
 
 ROWS, SIGMA_PX = 60, 0.5
-PERIODS_NS = [1_000_000, 10_000_000, 100_000_000, 1_000_000_000, 10_000_000_000]
+PERIODS_NS = [1_000_000, 100_000_000, 10_000_000_000]
 
 
 def random_rows(arena: Arena, period_ns: int, numbered: bool = True) -> list[Detections]:
@@ -45,7 +45,7 @@ def calibrated(period_ns: int, declared: bool) -> tuple[Arena, WandCalibration]:
 
 
 @pytest.mark.parametrize("declared", [True, False], ids=["declared", "detected"])
-@pytest.mark.parametrize("period_ns", PERIODS_NS, ids=["1 ms", "10 ms", "0.1 s", "1 s", "10 s"])
+@pytest.mark.parametrize("period_ns", PERIODS_NS, ids=["1 ms", "0.1 s", "10 s"])
 def test_sixty_random_instants_are_placed_alike_at_any_period(period_ns: int, declared: bool):
     """The result depends on the order of the instants only: to rounding at all periods. Sixty instants determine
     positions to 5 mm, 1 sigma."""
@@ -60,9 +60,9 @@ def test_sixty_random_instants_are_placed_alike_at_any_period(period_ns: int, de
 
 
 def test_the_chosen_model_is_reported_with_the_reason():
-    assert "declared" in calibrated(PERIODS_NS[3], True)[1].report.timing
-    assert "synchronous cameras: " in calibrated(PERIODS_NS[3], False)[1].report.timing
-    assert "without clock offsets" in calibrated(PERIODS_NS[2], False)[1].report.timing
+    assert "declared" in calibrated(PERIODS_NS[2], True)[1].report.timing
+    assert "synchronous cameras: " in calibrated(PERIODS_NS[2], False)[1].report.timing
+    assert "without clock offsets" in calibrated(PERIODS_NS[1], False)[1].report.timing
 
 
 def test_equal_stamps_of_cameras_that_are_not_synchronous_get_offsets():
@@ -70,7 +70,7 @@ def test_equal_stamps_of_cameras_that_are_not_synchronous_get_offsets():
     scenario = WandScenario(
         cameras=4,
         arc=0.5,
-        seconds=15,
+        seconds=8,
         rate_hz=30,
         offset_ms=0,
         drift_ppm=0,

@@ -22,7 +22,7 @@ from tests.calib.synthetic import CAREFUL, STICK, joint_error, roughly
 LIGHTS = WandScenario(
     cameras=5,
     seconds=12.0,
-    rate_hz=30.0,
+    rate_hz=20.0,
     sigma_px=0.3,
     sized=False,
     both_sides=True,
@@ -98,21 +98,21 @@ def test_ends_are_distinguished(scenario: WandScenario):
 
 def test_cameras_with_faults_are_named():
     """One has a clock error of three seconds and is placed, one shares too few frame sets."""
-    recorded = record(LIGHTS)
+    recorded = record(replace(LIGHTS, cameras=4))
     late = [
         msgspec.structs.replace(m, t_ns=m.t_ns + 3_000_000_000) if m.camera == "cam01" else m
         for m in unnumbered(recorded.messages)
-        if m.camera != "cam04" or m.seq % 40 == 0
+        if m.camera != "cam03" or m.seq % 40 == 0
     ]
     result = place(recorded, late)
     assert "camera 'cam01' the stamps are 3.0 s later" in result.report.timing
-    assert "at least 8" in result.report.unplaced["cam04"]
-    assert result.names == ["cam00", "cam01", "cam02", "cam03"]
+    assert "at least 8" in result.report.unplaced["cam03"]
+    assert result.names == ["cam00", "cam01", "cam02"]
 
 
 def test_too_few_detections_are_refused():
     """No two cameras have simultaneous detections; and a recording of 0.2 s."""
-    recorded = record(LIGHTS)
+    recorded = record(replace(LIGHTS, rate_hz=30.0))
     messages = unnumbered(recorded.messages)
     alone = [m for m in messages if (m.t_ns // 1_000_000_000) % 5 == int(m.camera[3:])]
     with pytest.raises(

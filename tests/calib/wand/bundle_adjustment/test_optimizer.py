@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib.errors import CalibrationError
 from calib.rig.camera import DRIFT, LENS, OFFSET, PER_CAMERA, POSE, READOUT
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
@@ -24,6 +23,7 @@ from calib.wand.detections import Timing, gather
 from calib.wand.initial_rig import TwoViewGeometry
 from calib.wand.labels import label
 from calib.wand.trajectory import locate, position_weights, velocity_weights
+from calib.wand.wand_report import WandCalibration
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import skew
 from camera_node.protocol.messages import Detections
@@ -35,13 +35,18 @@ from tests.calib.synthetic import camera_errors, joint_error, outlines, record, 
 
 @pytest.fixture(scope="module")
 def recorded() -> SimulatedRecording:
-    return record_wave(WandScenario(cameras=6, seconds=15.0, rate_hz=30.0, seed=3))
+    return record_wave(WandScenario(cameras=6, seconds=15.0, rate_hz=20.0, seed=3))
 
 
-def test_jacobians_are_those_of_the_residuals():
-    """Against central differences, whose error is of second order in the step: 1e-5 of the largest entry at most."""
+@pytest.fixture(scope="module")
+def result() -> WandCalibration:
+    """The calibration of three cameras."""
     arena = ring(3)
-    result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
+    return calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
+
+
+def test_jacobians_are_those_of_the_residuals(result: WandCalibration):
+    """Against central differences, whose error is of second order in the step: 1e-5 of the largest entry at most."""
     problem = result.adjusted.problem.with_free(POSE, OFFSET, DRIFT, READOUT, LENS)
     seen, state = result.observations, result.adjusted.state
     along = np.zeros((len(state.motion), state.motion[0].size))
@@ -58,11 +63,9 @@ def test_jacobians_are_those_of_the_residuals():
         assert J[:, :, parameter] == pytest.approx(expected, abs=1e-3 * np.abs(expected).max() + 1e-6)
 
 
-def test_gauge_directions_change_no_residual():
+def test_gauge_directions_change_no_residual(result: WandCalibration):
     """Moves the cameras by `gauge_directions`, and the wand with them, by 1e-5: the rest is of second order, 1e-10
     times the 600 px of a radian."""
-    arena = ring(3)
-    result = calibrate(arena.intrinsics, arena.wand, record(arena, 3.0, sigma_px=0.1))
     problem, seen, state = result.adjusted.problem, result.observations, result.adjusted.state
     by = np.zeros((len(state.cameras), PER_CAMERA))
     for column, twist in zip(gauge_directions(state, POSE).T, np.eye(6), strict=True):
@@ -144,17 +147,13 @@ def test_missing_time_in_all_cameras_rejects_no_observation():
 
 
 def test_clocks_and_lenses_are_adjusted_where_the_data_need_it(recorded: SimulatedRecording):
-    """Offsets are right within four standard deviations and 0.3 ms; true lenses stay within four of theirs. A focal
-    length that is 2 % off is estimated within three times its standard deviation of 0.2 %."""
+    """Offsets are right within four standard deviations and 0.3 ms; true lenses stay within four of theirs."""
     result = calibrate(recorded.intrinsics, WandScenario().wand, recorded.messages)
     truth = np.array([recorded.truth.cameras[n].time_offset_ms for n in result.names])
     error = result.time_offset_ms - truth
     error -= error.mean()
     assert (np.abs(error) < np.minimum(4 * result.time_sigma_ms, 0.3)).all()
     assert (np.abs(result.adjusted.state.lenses) < 4 * result.adjusted.problem.lens_sigma).all()
-    wrong = scale_focal(recorded, "cam02", 1.02)
-    result = calibrate(wrong, WandScenario().wand, recorded.messages)
-    assert result.rig.cameras["cam02"].fx == pytest.approx(recorded.truth.cameras["cam02"].fx, rel=0.006)
 
 
 def scale_focal(recorded: SimulatedRecording, name: str, factor: float) -> Rig:
@@ -163,20 +162,14 @@ def scale_focal(recorded: SimulatedRecording, name: str, factor: float) -> Rig:
     return Rig(cameras={**recorded.intrinsics.cameras, name: wrong})
 
 
-def test_cameras_that_the_recording_contradicts_are_named_and_left_out(recorded: SimulatedRecording):
-    """The other cameras are as accurate as without them: 15 s determine positions to 0.5 mm, 1 sigma."""
-    rig, wand = recorded.intrinsics, WandScenario().wand
-    swapped = {**rig.cameras, "cam00": rig.cameras["cam03"], "cam03": rig.cameras["cam00"]}
-    mirrored = [mirror(m) if m.camera == "cam01" else m for m in recorded.messages]
-    cases = [
-        (Rig(cameras=swapped), recorded.messages, {"cam00": "of 'cam03'", "cam03": "of 'cam00'"}),
-        (rig, mirrored, {"cam01": "no pose explains them"}),
-    ]
-    for given, messages, expected in cases:
-        result = calibrate(given, wand, messages)
-        assert set(result.report.unplaced) == set(expected)
-        assert all(why in result.report.unplaced[name] for name, why in expected.items())
-        assert camera_errors(result.rig, recorded.truth)[0].max() < 2e-3
+def test_a_camera_that_the_recording_contradicts_is_named_and_left_out(recorded: SimulatedRecording):
+    """The other cameras are within four reported standard deviations."""
+    messages = [mirror(m) if m.camera == "cam01" else m for m in recorded.messages]
+    result = calibrate(recorded.intrinsics, WandScenario().wand, messages)
+    assert set(result.report.unplaced) == {"cam01"}
+    assert "no pose explains them" in result.report.unplaced["cam01"]
+    off_mm = 1e3 * camera_errors(result.rig, recorded.truth)[0]
+    assert (off_mm < 4 * np.array([camera.sigma_mm for camera in result.report.cameras])).all()
 
 
 def test_half_of_the_lenses_may_be_wrong(recorded: SimulatedRecording):
@@ -196,17 +189,10 @@ def mirror(message: Detections) -> Detections:
     return repack(message, altered(roundels, uv=uv, angle_rad=-roundels.angle_rad))
 
 
-def test_a_wand_file_that_the_recording_contradicts_is_refused(recorded: SimulatedRecording):
-    rig, wand = recorded.intrinsics, WandScenario().wand
-    longer = Body(diameter_m=wand.diameter_m, markers=tuple((1.08 * x, y, z) for x, y, z in wand.markers))
-    with pytest.raises(CalibrationError, match="lengths and its roundels' sizes disagree"):
-        calibrate(rig, longer, recorded.messages)
-
-
 def test_drift_is_estimated():
     """Clocks drift up to 50 ppm apart over a minute without an offset in its middle: drifts are right within four
     sigmas (Bonferroni over four cameras: wrong once in 4000) and there are no offsets."""
-    scenario = WandScenario(cameras=4, rate_hz=30.0, offset_ms=0, seed=6)
+    scenario = WandScenario(cameras=4, rate_hz=15.0, offset_ms=0, seed=6)
     recorded = record_wave(scenario)
     result = calibrate(recorded.intrinsics, scenario.wand, recorded.messages)
     truth = np.array([recorded.drift_ppm[name] for name in result.names])
@@ -220,7 +206,7 @@ def test_the_covariance_of_time_offsets_of_a_short_recording_is_right():
     be five times the mean."""
     squared, degrees = 0.0, 0
     for seed in range(4):
-        scenario = WandScenario(cameras=4, seconds=10, speed=1.5, drift_ppm=80, seed=seed)
+        scenario = WandScenario(cameras=4, seconds=10, rate_hz=30, speed=1.5, drift_ppm=80, seed=seed)
         recorded = record_wave(scenario)
         result = calibrate(recorded.intrinsics, scenario.wand, recorded.messages)
         truth = np.array([recorded.truth.cameras[name].time_offset_ms for name in result.names])
@@ -231,7 +217,8 @@ def test_the_covariance_of_time_offsets_of_a_short_recording_is_right():
     assert chi2.ppf(0.001, degrees) < squared < chi2.ppf(0.999, degrees)
 
 
-def test_noise_gives_no_clock_parameters():
+@pytest.mark.parametrize("seeds", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_noise_gives_no_clock_parameters(seeds: int):
     """Three synchronized cameras, 15 s of a stick at 10 Hz, 1.5 px of noise, 5 % of gross errors: there are no offsets;
     an offset of 3 ms is estimated within four standard deviations. Schwarz's criterion has false positives: of ten
     seeds at 10 Hz and ten at 30 Hz, one gave a drift (seed 3 at 10 Hz)."""
@@ -240,7 +227,7 @@ def test_noise_gives_no_clock_parameters():
         cameras=3, arc=0.5, seconds=15, rate_hz=10, sigma_px=1.5, offset_ms=0, drift_ppm=0, wand=stick
     )
     scenario = replace(scenario, free_running=False, numbered=True, sized=False, both_sides=True)
-    for seed in (2, 1, 0):
+    for seed in reversed(range(seeds)):
         recorded = record_wave(replace(scenario, seed=seed))
         result = calibrate(recorded.intrinsics, stick, recorded.messages)
         assert not result.time_sigma_ms.any()
