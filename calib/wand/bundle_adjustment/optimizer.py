@@ -15,8 +15,7 @@ from itertools import combinations
 from typing import Any, cast
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from calib.rig.camera import PER_CAMERA, READOUT
 from calib.rig.estimation import CAUCHY_SCALE, GROSS, coordinate_sigma
@@ -44,6 +43,8 @@ from calib.wand.bundle_adjustment.residuals import (
 )
 from camera_node.foundation.arrays import Array, Index, Mask
 
+# Cholesky factors and triangular solutions, without the checks of NumPy and SciPy, which take longer than these.
+[potrf], [trsm] = get_lapack_funcs(["potrf"]), get_blas_funcs(["trsm"])
 INTERRUPTED = 4.0  # sigmas, over all coordinates: something hit the wand, or frames are missing
 MAX_ITERATIONS, MAX_ROUNDS = 60, 5
 START_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-5, 1e-9, 1e6  # the first step is damped by a tenth of the start
@@ -459,7 +460,7 @@ class BlockTridiagonal:
         blocks = self.diagonal.copy()
         for k, link in enumerate(self.below):
             # The Cholesky factor of what remains of this block after the elimination of those before.
-            by_link = dtrsm(1.0, dpotrf(blocks[k], lower=1)[0], link.T, lower=1)
+            by_link = trsm(1.0, potrf(blocks[k], lower=1)[0], link.T, lower=1)
             blocks[k + 1] -= by_link.T @ by_link
         root = np.linalg.inv(np.linalg.cholesky(blocks))
         inverse = root.mT @ root
