@@ -105,6 +105,7 @@ struct PrintEstimate {
 struct ShadingEstimate {
     Shading seen;
     PoseCovariance effect{};  // on the covariance, in units of the noise
+    double ratio = 0;         // on the ratio's variance, in the same units
 };
 
 /// One photometric fit: the state that its stages share. `fit_photometric`, at the end, calls them in order.
@@ -567,7 +568,8 @@ void PhotometricFitter::use_print(const Print& print) {
 /// columns with those of the parameters, D their own, e their residuals, and L and m the information and the
 /// mean of the prior,
 ///   S = D + L - C^T H^-1 C,  shading = S^-1 (e - C^T step + L m),  pose <- pose - (H^-1 C shading)_pose.
-/// The covariance grows by H^-1 C S^-1 C^T H^-1. The shading is relative to the level at the pixels' origin.
+/// The covariance grows by H^-1 C S^-1 C^T H^-1. So do the measured ratio and its variance, which the light
+/// displaces where a part of the ring is covered. The shading is relative to the level at the pixels' origin.
 void PhotometricFitter::allow_shading(const LightGradient& light) {
     const auto products = shading_products(equations_, pixels_, {scale_, spread_});
     const auto& [Cx, Cy] = products.parameters;
@@ -595,7 +597,18 @@ void PhotometricFitter::allow_shading(const LightGradient& light) {
     const double left_x = shading_.seen.x - sx, left_y = shading_.seen.y - sy;
     const bool contradicts =
         square(left_x) + square(left_y) > kUnlikelyField * (shading_.seen.variance + square(light.sigma));
-    const auto Kx = factor_->solve_tail<kPoseCount>(yx), Ky = factor_->solve_tail<kPoseCount>(yy);
+    const Parameters by_x = factor_->solve_tail<kCount>(yx), by_y = factor_->solve_tail<kCount>(yy);
+    const double* Kx = &by_x[kX];
+    const double* Ky = &by_y[kX];
+    const auto covariance = [&](double ix, double iy, double jx, double jy) {
+        return (S.yy * ix * jx - S.xy * (ix * jy + iy * jx) + S.xx * iy * jy) / det;
+    };
+    // Around a whole ring the displacements of opposite sides cancel; what a covered one itself shows may be
+    // its cover.
+    if (occlusion_.any()) {
+        p_[kRatio] -= by_x[kRatio] * light.x + by_y[kRatio] * light.y;
+        shading_.ratio = (square(by_x[kRatio]) + square(by_y[kRatio])) / prior;
+    }
     Vector<kPoseCount>
         left{};  // the shift by what the prior does not allow of the shading seen, over the noise
     for (int i = 0; i < kPoseCount; ++i) {
@@ -604,9 +617,7 @@ void PhotometricFitter::allow_shading(const LightGradient& light) {
     }
     for (int i = 0; i < kPoseCount; ++i)
         for (int j = 0; j < kPoseCount; ++j)
-            shading_.effect[i][j] =
-                left[i] * left[j] +
-                (S.yy * Kx[i] * Kx[j] - S.xy * (Kx[i] * Ky[j] + Ky[i] * Kx[j]) + S.xx * Ky[i] * Ky[j]) / det;
+            shading_.effect[i][j] = left[i] * left[j] + covariance(Kx[i], Ky[i], Kx[j], Ky[j]);
 }
 
 // 6. The result
@@ -650,7 +661,7 @@ RoundelFit PhotometricFitter::fit() const {
     if (print_.ratio > 0) fit.p[kRatio] = print_.ratio;
     fit.ratio = ratio();
     fit.curvature = tone_.expected;
-    fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio]);
+    fit.ratio_sigma = std::sqrt(covariance_with_ratio()[kRatio] + square(noise_) * shading_.ratio);
     fit.edge_residual = std::sqrt(sums_.ring_rr / sums_.ring);
     fit.noise = scale_;
     fit.ground = spread_ && ground_ > kEvenGround ? ground_ : 0;

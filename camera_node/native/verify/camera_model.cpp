@@ -8,7 +8,8 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMaxLogExponent = 0.9;  // 2.5: steeper ones enlarge what compression leaves
+constexpr double kMaxLogExponent = 0.9;  // in use, 2.5: steeper ones enlarge what compression leaves
+constexpr double kSteepest = 3;          // measured, 20: powers of levels remain numbers
 constexpr int kSteps = 6;                // of Newton's method
 // A print that is only assumed or estimated:
 constexpr double kMaxByCurvature = 0.06;  // smaller roundels may be those of another print
@@ -18,8 +19,10 @@ constexpr double kMinTone = 0.1;
 constexpr double kMinLeft = 0.15;    // of a curvature: less is the error of the print, or learned as a spread
 constexpr double kMinChange = 0.02;  // of the logarithm
 constexpr double kMaxSigma = 0.15;   // of the logarithm, from which it is used
-constexpr size_t kMaxMeasured = 8;   // roundels of a frame
-constexpr double kMedianSquare = 0.455;  // of a normal variable of variance 1
+// Of normal variables: the median's standard deviation times the root of their number, over their median
+// distance from it, sqrt(pi / 2) times 1.48; and the median square over the variance.
+constexpr double kMedianSigma = 1.86;
+constexpr double kMedianSquare = 0.455;
 
 /// The logarithm of the exponent that makes a level, at a share of `middle` between `dark` and `bright`, the
 /// mean of both; levels of 255. It is the exponent of the power mean of both that is this level.
@@ -31,7 +34,7 @@ double log_exponent_of(double dark, double bright, double middle) {
         const double g = std::exp(log_g), of_dark = std::exp(g * d), of_bright = std::exp(g * b);
         const double off = m - std::log((of_dark + of_bright) / 2) / g;
         const double slope = m - off - (d * of_dark + b * of_bright) / (of_dark + of_bright);
-        log_g = std::clamp(log_g - off / slope, -kMaxLogExponent, kMaxLogExponent);
+        log_g = std::clamp(log_g - off / slope, -kSteepest, kSteepest);
     }
     return log_g;
 }
@@ -65,13 +68,14 @@ CameraPrior CameraModel::prior_at(double x, double y) const {
 
 void CameraModel::observe(const std::vector<Observation>& roundels, const ImageView& image) {
     if (ratios_ && ratios_->learn(roundels)) prints_ = ratios_->prints();
-    std::vector<const RoundelFit*> all, whole;
+    std::vector<const RoundelFit*> all, lit, whole;
     for (const auto& [fit, track] : roundels) {
         all.push_back(fit);
         if (fit->unoccluded) whole.push_back(fit);
+        if (fit->unoccluded || fit->provisional) lit.push_back(fit);
     }
     if (contradicts(roundels)) forget();
-    light_.learn(whole, image);
+    light_.learn(lit, image);
     learn_response(all);
     bend_.learn(whole, std::max(1.0, correlation_.value()));
 }
@@ -81,9 +85,8 @@ void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
     learn_edge_noise(fits);
     std::vector<ToneEstimate> measured;
     std::vector<ToneSample> samples;
-    const size_t step = (fits.size() + kMaxMeasured - 1) / kMaxMeasured;
-    for (size_t k = 0; k < fits.size(); k += step)
-        if (const auto estimate = measure(*fits[k])) {
+    for (const RoundelFit* fit : fits)
+        if (const auto estimate = measure(*fit)) {
             measured.push_back(estimate->power);
             samples.push_back(estimate->sample);
         }
@@ -109,7 +112,8 @@ std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFi
     const double sigma = std::hypot(fit.ratio_sigma, print.sigma) / by_curvature;
     if (std::abs(curvature) + sigma > kMaxCurvature) return std::nullopt;
     const bool is_other = left < kMinCurvature && !is_new_;
-    if (!print.is_exact() && (by_curvature > kMaxByCurvature || is_other)) return std::nullopt;
+    if (print.assumed && by_curvature > kMaxByCurvature) return std::nullopt;
+    if (!print.is_exact() && is_other) return std::nullopt;
     const auto exponent = [&](double k) { return log_exponent_of(fit.dark, fit.bright, 0.5 + k / 4); };
     const double here = exponent(curvature);
     const double middle = fit.dark + (0.5 + curvature / 4) * fit.contrast();
@@ -228,21 +232,24 @@ void CameraModel::learn_curvature(const std::vector<const RoundelFit*>& fits) {
 }
 
 /// Includes the estimates of a frame. The error of the print is common to all, so a frame, and all frames,
-/// are as certain as the best roundel.
+/// are as certain as the best roundel, beside what the scatter of the estimates makes of their median.
 bool CameraModel::learn_tone(std::vector<ToneEstimate> measured) {
     const double middle = median_of(measured, &ToneEstimate::log_exponent).log_exponent;
-    const double sigma = std::min_element(measured.begin(), measured.end(), [](const auto& a, const auto& b) {
+    const double exact = std::min_element(measured.begin(), measured.end(), [](const auto& a, const auto& b) {
                              return a.sigma < b.sigma;
                          })->sigma;
+    std::vector<double> off;
+    for (const ToneEstimate& estimate : measured) off.push_back(std::abs(estimate.log_exponent - middle));
     mean_.include(middle);
-    sigma_.include(sigma);
-    const double mean = mean_.value(), change = std::abs(mean - log_exponent_);
+    sigma_.include(std::hypot(exact, kMedianSigma * median_of(off) / std::sqrt(double(off.size()))));
+    const double mean = std::clamp(mean_.value(), -kMaxLogExponent, kMaxLogExponent);
+    const double change = std::abs(mean - log_exponent_);
     const double enough = log_exponent_ == 0 ? std::max(kMinTone, 2 * sigma_.value()) : kMinChange;
     knows_tone_ |= sigma_.value() <= kMaxSigma;
     if (sigma_.value() > kMaxSigma || change < enough) return false;
     // The next frame measures the rest: this one was not linear.
     if (change > kMinTone) forget_response();
-    set_exponent(std::abs(mean) < kMinTone / 2 ? 0 : std::clamp(mean, -kMaxLogExponent, kMaxLogExponent));
+    set_exponent(std::abs(mean) < kMinTone / 2 ? 0 : mean);
     return true;
 }
 

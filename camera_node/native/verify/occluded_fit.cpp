@@ -79,14 +79,14 @@ Sectors find_foreign(const SectorView& view, const RoundelFit& fit, double noise
     return foreign;
 }
 
-/// Whether the paper around the ring ends at the same radius in many sectors, as on a round card. No letter
-/// is printed on a round card of its own size.
-bool has_round_card(const SectorView& view) {
+/// Whether the paper around the ring ends at the same radius in many sectors, as on a round card: where
+/// levels differ from it by `limit`. No letter is printed on a round card of its own size.
+bool ends_round(const SectorView& view, double limit) {
     Sectors paper = ~Sectors(0);
     std::array<int, kSteps> ends{};
     for (int k = 0; k < kSteps; ++k) {
-        const Sectors beyond = paper & view.find(kFirstRadius + k * kStep, [](double level) {
-            return std::abs(level - 1) > kWrongLevel;
+        const Sectors beyond = paper & view.find(kFirstRadius + k * kStep, [limit](double level) {
+            return std::abs(level - 1) > limit;
         });
         ends[size_t(k)] = count_sectors(beyond);
         paper &= ~beyond;
@@ -94,6 +94,14 @@ bool has_round_card(const SectorView& view) {
     for (auto from = ends.begin() + kFirst; from + kBlurredSteps <= ends.end(); ++from)
         if (std::accumulate(from, from + kBlurredSteps, 0) >= kMinSectors) return true;
     return false;
+}
+
+/// A round card ends at a wrong level, or half way to the level that the fit finds beyond it: a tone curve
+/// makes grey ground nearly as bright as paper.
+bool has_round_card(const SectorView& view, const RoundelFit& fit, double noise) {
+    const double half = std::abs(fit.share(fit.p[kGround]) - 1) / 2;
+    const double limit = std::max(half, kForeignSigmas * noise / fit.contrast());
+    return ends_round(view, kWrongLevel) || (limit < kWrongLevel && ends_round(view, limit));
 }
 
 /// Whether a masked part of the ring shows only ink and paper, as letters do. Letters have ink in the hole or
@@ -128,12 +136,16 @@ bool hides_inner_edge_only(const OcclusionMask& mask) {
     return !mask.outer && count_sectors(mask.inner) > kSectors / 2;
 }
 
-/// Whether the ratio is that of a print. Of a new roundel nothing else is known in advance. An occlusion that
-/// the residuals do not show biases the ratio as well as the position.
-bool has_print_ratio(const RoundelFit& fit, std::span<const Print> prints, double slack) {
-    return prints.empty() ||
-           std::abs(nearest_print(prints, fit.ratio).ratio - fit.ratio) <
-               std::hypot(kMaxRatioError, 2 * std::min(fit.ratio_sigma, kMaxRatioSigma), slack);
+/// Whether the ratio is that of a print, through any tone curve of a camera if `by_curvature` is not 0. Of a
+/// new roundel nothing else is known in advance. An occlusion that the residuals do not show biases the ratio
+/// as well as the position.
+bool has_print_ratio(const RoundelFit& fit, std::span<const Print> prints, double by_curvature) {
+    const double error = std::hypot(kMaxRatioError, 2 * std::min(fit.ratio_sigma, kMaxRatioSigma));
+    return prints.empty() || std::any_of(prints.begin(), prints.end(), [&](const Print& print) {
+               const double off = fit.ratio - print.ratio;
+               return off > kMinCurvature * by_curvature - error &&
+                      off < kMaxCurvature * by_curvature + error;
+           });
 }
 
 }  // namespace
@@ -147,10 +159,10 @@ bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noi
 }
 
 bool is_certain_roundel(const ImageView& image, const RoundelFit& fit, const InitialGuess& guess,
-                        double noise, double ratio_slack) {
-    if (!has_print_ratio(fit, guess.camera.prints, ratio_slack)) return false;
+                        double noise, double by_curvature) {
+    if (!has_print_ratio(fit, guess.camera.prints, by_curvature)) return false;
     const SectorView view(image, fit);
-    return has_round_card(view) || !is_letter(view, fit, guess.occlusion, noise);
+    return has_round_card(view, fit, noise) || !is_letter(view, fit, guess.occlusion, noise);
 }
 
 std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGuess& input) {
@@ -179,7 +191,7 @@ std::optional<RoundelFit> fit_occluded(const ImageView& image, const OccludedGue
     if (input.known) return fit;
     if (hides_inner_edge_only(guess.occlusion)) return std::nullopt;
     fit.provisional = !input.knows_camera;
-    const double tone = fit.provisional ? 2 * kCurvaturePrior * ratio_by_curvature(fit, fit.ratio) : 0;
+    const double tone = fit.provisional ? ratio_by_curvature(fit, fit.ratio) : 0;
     return is_certain_roundel(image, fit, guess, input.noise, tone) ? std::optional(fit) : std::nullopt;
 }
 

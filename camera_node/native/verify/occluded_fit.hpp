@@ -16,10 +16,11 @@ bool is_explained_by_noise(const RoundelFit& fit, double noise);
 bool shows_occlusion(const EdgeMisfit& misfit, const RoundelFit& fit, double noise);
 
 /// Whether a fit that does not show all of a roundel, or shows it in uneven light, is no letter: its ratio is
-/// that of a print within 0.01, and either it has a round card, or the levels of the parts that the guess
+/// that of a print within 0.01 (or through a tone curve that is not known yet, if `by_curvature` is how much
+/// one of curvature 1 enlarges it), and either it has a round card, or the levels of the parts that the guess
 /// leaves out are not those of ink and paper.
 bool is_certain_roundel(const ImageView& image, const RoundelFit& fit, const InitialGuess& guess,
-                        double noise, double ratio_slack = 0);
+                        double noise, double by_curvature = 0);
 
 /// The input of a fit to the visible part of a roundel.
 struct OccludedGuess {
