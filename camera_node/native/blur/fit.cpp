@@ -29,7 +29,6 @@ struct Stage {
 };
 constexpr Stage kCoarse{240, 1.5, 8, 7, 0.1, false}, kFine{1200, 1, 1000, 5, 0.01, true};
 
-constexpr double kInitialBlur = 0.9;
 // Prior standard deviations. They are smaller than those of fit_photometric: a motion hides both.
 constexpr double kRatioPrior = 0.05;
 constexpr double kBlurPrior = 0.5;

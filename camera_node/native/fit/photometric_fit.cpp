@@ -36,7 +36,6 @@ constexpr double kNoiseFloor = 1;    // grey levels
 constexpr double kGroundChance = 4;  // standard deviations of the ground's residuals, by noise
 constexpr double kEvenGround = 4;    // spread that halves the weight of pixels at the card's edge
 constexpr double kReweighed = 0.1;   // of a step that changes the weights of residuals: what is left of it
-constexpr double kInitialBlur = 0.8;
 constexpr double kRatioPrior = 0.3;  // standard deviation
 constexpr double kBlurPrior = 1;     // standard deviation
 

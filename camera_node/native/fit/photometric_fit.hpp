@@ -21,6 +21,14 @@ namespace roundel {
 /// of phi(x)^2 dx, 1 / (2 sqrt(pi)).
 constexpr double kEdgeShift = 0.5908179503;
 
+constexpr double kInitialBlur = 0.8;  // pixels: of a guess, before the fit
+
+/// How much a tone curve enlarges the measured ratio of a roundel, for each unit of its curvature: both edges
+/// move into the ring.
+inline double ratio_by_curvature(const Ellipse& outer, double ratio, double blur) {
+    return (1 + ratio) * blur * kEdgeShift / (std::sqrt(outer.major * outer.minor) / 2);
+}
+
 /// The fields that a fit may contain if the residuals show them.
 enum class AllowedFields { kNone, kBend, kAll };
 

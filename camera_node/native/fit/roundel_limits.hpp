@@ -62,11 +62,11 @@ struct RoundelLimits {
         const Print& print = nearest_print(prints, measured);
         return std::max(0.0, std::abs(print.ratio - measured) - 2 * (print.sigma - Print::kPaper));
     }
-    /// Whether a ring may be a print that is not known.
-    bool may_be_print(double measured, double major) const {
+    /// Whether a ring may be a print that is not known, which a tone curve enlarges by up to `by_tone`.
+    bool may_be_print(double measured, double major, double by_tone = 0) const {
         const auto [least, most] = kAnyPrint;
         return any_print && major >= kMinAnyPrint && measured > least - kAnyTolerance &&
-               measured < most + kAnyTolerance;
+               measured < most + std::max(kAnyTolerance, by_tone);
     }
 };
 

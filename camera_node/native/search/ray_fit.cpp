@@ -85,7 +85,8 @@ std::optional<InitialGuess> cast_and_fit(const ImageView& image, const Seed& see
 
 bool is_plausible(const InitialGuess& guess, const RoundelLimits& limits) {
     const bool is_print = limits.print_error(guess.ratio) < limits.ratio_tolerance + 1 / guess.outer.minor;
-    return (is_print || limits.may_be_print(guess.ratio, guess.outer.major)) &&
+    const double by_tone = kMaxCurvature * ratio_by_curvature(guess.outer, guess.ratio, kInitialBlur);
+    return (is_print || limits.may_be_print(guess.ratio, guess.outer.major, by_tone)) &&
            guess.outer.major > 0.8 * limits.min_diameter && guess.outer.major < 1.2 * limits.max_diameter &&
            guess.outer.minor > 3 && guess.bright - guess.dark > limits.min_contrast / 2;
 }

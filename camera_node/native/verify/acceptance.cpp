@@ -179,7 +179,8 @@ bool has_known_ratio(const RoundelFit& fit, const RoundelLimits& limits) {
 }
 
 std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits) {
-    if (!has_known_ratio(fit, limits) && !limits.may_be_print(fit.ratio, fit.outer.major))
+    const double by_tone = kMaxCurvature * ratio_by_curvature(fit, fit.ratio);
+    if (!has_known_ratio(fit, limits) && !limits.may_be_print(fit.ratio, fit.outer.major, by_tone))
         return Refusal::kRatio;
     if (limits.contrast(fit.dark, fit.bright) < limits.min_contrast) return Refusal::kContrast;
     const double major = fit.outer.major;

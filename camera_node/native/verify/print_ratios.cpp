@@ -33,11 +33,6 @@ std::vector<Print> assumed_prints() {
 
 }  // namespace
 
-double ratio_by_curvature(const RoundelFit& fit, double print_ratio) {
-    const double radius = std::sqrt(fit.outer.major * fit.outer.minor) / 2;
-    return (1 + print_ratio) * fit.blur * kEdgeShift / radius;
-}
-
 Regression<2>::Estimate PrintRatios::Kind::estimate() const {
     return regression.solve({0, 1 / square(kCurvaturePrior)}).value();
 }

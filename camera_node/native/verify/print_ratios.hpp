@@ -11,9 +11,9 @@ namespace roundel {
 
 constexpr double kCurvaturePrior = 0.6;  // standard deviation of a tone curve's; 0.7 is a gamma of 2.2
 
-/// How much a tone curve enlarges the measured ratio of a roundel with this print, for each unit of its
-/// curvature.
-double ratio_by_curvature(const RoundelFit& fit, double print_ratio);
+inline double ratio_by_curvature(const RoundelFit& fit, double print_ratio) {
+    return ratio_by_curvature(fit.outer, print_ratio, fit.blur);
+}
 
 /// A roundel of a frame without occlusion, and the number of its track.
 struct Observation {

@@ -9,7 +9,10 @@ import pytest
 from camera_node.detection.detector import Detector
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.simulation.sensor import CLEAN, MILD, Sensor
+from tests.benchmarks.detector.cameras import share_of_print
+from tests.benchmarks.detector.models import SHARPENED
 from tests.benchmarks.detector.pictures import Card, flat, paste
+from tests.benchmarks.detector.table import Run
 
 SIZE = (180, 260)
 SIZES = (20, 24, 28, 34, 40, 44)  # pixels
@@ -39,6 +42,11 @@ def test_any_print_is_found(ratio: float, sensor: Sensor):
     counts = [len(detector.detect(frame(ratio, sensor, seed))) for seed in range(4)]
     assert counts[1:] == [len(SIZES)] * 3
     assert detector.found_ratios == pytest.approx([ratio], abs=0.03)
+
+
+def test_thin_rings_of_an_unknown_print_are_found_behind_a_filmic_curve():
+    """It makes 0.75 to 0.81 of a ratio of 0.7; a limit of 0.75 for all sizes left a quarter of them."""
+    assert share_of_print(Run("chords", Detector, False), SHARPENED["filmic and sharpened"], 0.7, 1) > 0.8
 
 
 def test_a_single_roundel_of_an_unknown_print_is_found():
