@@ -18,9 +18,8 @@ from calib.wand.wand_report import WandCalibration, WandReport
 from camera_node.foundation.terminal import console, say
 
 MIN_INFLATION = 1.2  # of standard deviations, that is printed
-MAX_READOUT_SIGMA_MS = (
-    2.0  # of a readout time that counts as determined: 1 mm at the edge of the image at 1 m/s
-)
+# Of a readout time that counts as determined: 1 mm at the edge of the image at 1 m/s
+MAX_READOUT_SIGMA_MS = 2.0
 MAX_GROSS = 0.15  # share of gross errors, above which a recording contradicts itself
 MAX_OUTLIERS = 5  # that are listed one by one
 

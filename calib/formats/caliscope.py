@@ -27,7 +27,7 @@ from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.config import is_name, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import invert, rotation_from_vector, vector_from_rotation
+from camera_node.geometry.pose import invert, motion_from, vector_from_rotation
 
 POINTS, TIMES = ("sync_index", "img_loc_x", "img_loc_y"), ("sync_index", "cam_id", "frame_time")
 PLACE = ("obj_loc_x", "obj_loc_y", "obj_loc_z")
@@ -113,9 +113,7 @@ def _name(key: str, entry: Mapping[str, Any]) -> str:
 def _build(entry: Mapping[str, Any]) -> Camera:
     K, T = np.asarray(entry["matrix"], float).reshape(3, 3), None
     if not any(_is_absent(entry.get(name)) for name in ("rotation", "translation")):
-        rotation, T = np.asarray(entry["rotation"], float), np.eye(4)
-        T[:3, :3] = rotation if rotation.shape == (3, 3) else rotation_from_vector(rotation.ravel())
-        T[:3, 3] = np.ravel(np.asarray(entry["translation"], float))
+        T = motion_from(entry["rotation"], np.asarray(entry["translation"], float))
     return make_camera(
         entry["size"],
         np.diag(K)[:2],

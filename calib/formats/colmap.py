@@ -17,7 +17,7 @@ from calib.rig.camera import Camera
 from calib.rig.rig import MAX_CAMERAS, Rig
 from camera_node.foundation.config import is_name, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import invert, rotation_from_wxyz, wxyz_from_rotation
+from camera_node.geometry.pose import invert, motion_from, rotation_from_wxyz, wxyz_from_rotation
 
 SHORT, FULL = 4, 8  # distortion coefficients of OPENCV and of FULL_OPENCV
 # Of each model: whether it has two focal lengths, the number of its coefficients, and whether it is a fisheye.
@@ -100,8 +100,7 @@ def _read_images(path: Path, lenses: dict[str, tuple[Any, Any, Any, Any, Any]]) 
             raise ConfigError(f"{path}: the pose of image '{row[9][:40]}' is not numbers") from None
         if not (np.isfinite(numbers).all() and np.linalg.norm(numbers[:4]) > 0):
             raise ConfigError(f"{path}: the pose of image '{row[9][:40]}' is not finite")
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_from_wxyz(numbers[:4] / np.linalg.norm(numbers[:4])), numbers[4:]
+        T = motion_from(rotation_from_wxyz(numbers[:4] / np.linalg.norm(numbers[:4])), numbers[4:])
         cameras[name] = make_camera(*lenses[row[8]], T)
     return cameras
 

@@ -24,7 +24,7 @@ from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 from camera_node.foundation.config import is_name, parse_yaml, read_yaml, write_atomically
 from camera_node.foundation.errors import ConfigError
-from camera_node.geometry.pose import invert, rotation_from_vector
+from camera_node.geometry.pose import invert, motion_from
 
 MULTIVIEW = ("Ks", "distortions", "rvecs", "Ts", "image_sizes", "is_fisheye", "cam_ids")
 BLOCK = re.compile(r"^(\w+):.*\n(?:[ \t].*\n|\n)*", re.MULTILINE)
@@ -97,11 +97,9 @@ def _read_multiview(path: Path, data: Any) -> dict[str, Camera]:
         names = [f"cam{k}" for k in range(count)]
     cameras = {}
     for k, name in enumerate(names):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_from_vector(turns[k]), shifts[k]
         of_model = distortions[k][:4] if fisheye[k, 0] else distortions[k]
         lens = sizes[k], K[k][[0, 4]], K[k][[2, 5]], of_model, bool(fisheye[k, 0])
-        cameras[name] = make_camera(*lens, T)
+        cameras[name] = make_camera(*lens, motion_from(turns[k], shifts[k]))
     return cameras
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_cost, cauchy_weights, coordinate_sigma
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import rotation_from_vector
+from camera_node.geometry.pose import motion_from, rotation_from_vector
 
 MAX_ITERATIONS = 100
 MAX_DAMPING = 1e10
@@ -173,8 +173,7 @@ def locate_board(lens: Lens, view: BoardView) -> Array | None:
         )
     except cv2.error:  # collinear corners
         return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation_from_vector(np.ravel(rotation)), np.ravel(translation)
+    T = motion_from(rotation, translation)
     return T if ok and (view.corners @ T[2, :3] + T[2, 3] > 0).all() else None
 
 

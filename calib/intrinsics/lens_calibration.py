@@ -36,9 +36,8 @@ NO_BOARD = "the board is in no image; check --board, and that the images show th
 MIN_VIEWS = 8
 MAX_VIEWS = 60  # more are slower, not better
 MIN_TILT_DEG = 10.0  # between views: parallel views leave the focal length open
-MAX_SIGMA = (
-    0.005  # median projection uncertainty, as a fraction of the longer side: beyond, a lens is useless
-)
+# Median projection uncertainty, as a fraction of the longer side: beyond, a lens is useless
+MAX_SIGMA = 0.005
 CLEARLY_BETTER = 0.8  # ratio of held-out residuals, below which the other lens model is suggested
 MAX_EXAMINED = 6  # images without a board, in which a mirrored one is looked for
 MAX_VIEW_RMS = 3.0  # of a view, in medians over views: beyond, it is an outlier (motion blur, a bent board)

@@ -15,9 +15,8 @@ from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
-MAX_MISFIT = (
-    0.2  # of a distance between two markers: the motion between frames changes it, a wrong match much more
-)
+# Of a distance between two markers: the motion between frames changes it, a wrong match much more
+MAX_MISFIT = 0.2
 MAX_CAMERAS = 4  # that locate a wand of two markers: each one doubles the number of correspondences
 ONE_FRAME = Timing(0.0, synchronous=True)  # labels need no other frames
 

@@ -15,23 +15,8 @@ from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.sensor_model.imaging import Ground, Imaging
 
-STEPS = (
-    0.05,
-    0.1,
-    0.15,
-    0.2,
-    0.25,
-    0.3,
-    0.4,
-    0.5,
-    0.75,
-    1.0,
-    1.5,
-    2.0,
-    3.0,
-    5.0,
-    10.0,
-)  # metres between grid points
+# Metres between grid points.
+STEPS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
 MAX_CAMERAS = 64
 MAX_ROOM_M = 200.0
 

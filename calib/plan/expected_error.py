@@ -40,9 +40,8 @@ NEAR_M = 0.01  # roundels nearer to the camera's plane are not seen
 FOCAL_PX = 1000.0  # of the lens for which the table is computed; the precision in pixels hardly depends on it
 MIN_MARKERS = 3  # from which the orientation of a robot is determined by its markers' positions
 TINY_PX = 1e-3  # keeps covariances regular
-REGULAR_M = (
-    100.0  # standard deviation of a position before any view; keeps the sums regular where nothing is seen
-)
+# Standard deviation of a position before any view; keeps the sums regular where nothing is seen
+REGULAR_M = 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,13 +230,11 @@ class ExpectedErrors:
 
     Attributes:
         position_mm: (N,) root mean square distance between a robot's position and the estimate.
-        worst_axis_mm: (N,) standard deviation of the position along its worst axis.
         orientation_deg: (N,) root mean square angle; NaN for robots with fewer than three markers.
         cameras: (N,) number of cameras that detect the roundels.
     """
 
     position_mm: Array
-    worst_axis_mm: Array
     orientation_deg: Array
     cameras: Index
 
@@ -316,14 +313,11 @@ def expected_errors(sums: CombinedViews, markers: Array) -> ExpectedErrors:
 
 
 def _summarize(cov: Array, count: Index) -> ExpectedErrors:
-    known = np.isfinite(cov).all(axis=(1, 2))
-    worst = np.full(len(cov), np.inf)
-    worst[known] = 1e3 * np.sqrt(np.linalg.eigvalsh(cov[known][:, :3, :3])[:, -1])
     angle = np.full(len(cov), np.nan)
     if cov.shape[1] == 6:
         angle = np.degrees(np.sqrt(np.einsum("nii->n", cov[:, 3:, 3:])))
     position = 1e3 * np.sqrt(np.einsum("nii->n", cov[:, :3, :3]))
-    return ExpectedErrors(position, worst, angle, count)
+    return ExpectedErrors(position, angle, count)
 
 
 def _common_covariance(camera: Camera, points: Array, J: Array, motion_m: float) -> Array:

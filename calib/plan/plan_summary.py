@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from calib.plan.planner import BUSY, CameraReach, PlanReport
-from calib.rig.precision_map import format_mm
+from calib.rig.precision_map import FloorGrid, error_rows
 from camera_node.foundation.arrays import Array
 
 COLUMNS = 13  # of a map as text, at most
@@ -129,11 +129,9 @@ def describe_map(report: PlanReport) -> list[str]:
     rows, columns = (
         np.unique(np.linspace(0, n - 1, min(n, COLUMNS)).round().astype(int)) for n in level.shape
     )
-    lines = [f"expected error in mm at z = {volume.z[0]:.2f} m (root mean square, one frame set):"]
-    for row in reversed(rows):
-        cells = "".join(f"{format_mm(level[row, column]):>6}" for column in columns)
-        lines.append(f"{volume.y[row]:>7.2f} |{cells}")
-    return [*lines, f"{'y / x':>7}  " + "".join(f"{volume.x[column]:>6.2f}" for column in columns)]
+    grid = FloorGrid(volume.x[columns], volume.y[rows], float(volume.z[0]))
+    title = f"expected error in mm at z = {grid.z:.2f} m (root mean square, one frame set):"
+    return [title, *error_rows(grid, level[np.ix_(rows, columns)])]
 
 
 def describe_coverage(report: PlanReport) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import Pose, invert, skew
+from camera_node.geometry.pose import Pose, invert, motion_from, skew
 
 AnyLens = TypeVar("AnyLens", bound=Lens)
 
@@ -136,8 +136,7 @@ def solve_view(points: Array, xy: Array) -> list[Array]:
         return []
     found = []
     for turn, shift in zip(turns, shifts, strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+        T = motion_from(turn, shift)
         if np.isfinite(T).all() and (transform(T, points)[:, 2] > 0).all():
             found.append(T)
     return found

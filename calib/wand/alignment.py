@@ -33,9 +33,8 @@ STEP_S = 0.1  # over which velocities are averaged: a hand moves below 2 Hz
 MAX_RATE = 0.03  # by which two clocks may differ: 29.97 frames a second read as 30 or 29, 24 as 25 is beyond
 MAX_TRACKS = 8  # markers of which each camera's velocity is used
 FEW = 8.0  # independent samples, which a correlation of two by two coordinates needs
-PROPOSALS = (
-    128  # shifts and rates that are judged; of each pair that was tried the right one was among the best 103
-)
+# Shifts and rates that are judged; of each pair that was tried the right one was among the best 103
+PROPOSALS = 128
 REFINED = 4  # proposals that are refined
 # By which the logarithm of the likelihood of the right one exceeds that of others: at most 29 in 240 pairs of cameras
 # that saw different motions, at least 40 in 15 s of a light and 75 in 10 s of a wand.
@@ -166,14 +165,6 @@ class _Signal:
         return np.nan_to_num(np.clip(moved, -limit, limit))
 
 
-@dataclass(frozen=True, slots=True)
-class _Match:
-    """The stamp of b that belongs to a stamp t of a: t (1 + rate) + shift."""
-
-    shift_s: float
-    rate: float
-
-
 def _chain(signals: dict[str, _Signal]) -> dict[str, ClockMap]:
     """Maps of the cameras into the clock of the one that has the longest tracks, directly or by others: first by clocks
     of one rate, which are soon tried, then by clocks of any."""
@@ -185,8 +176,9 @@ def _chain(signals: dict[str, _Signal]) -> dict[str, ClockMap]:
             for b in [name for name in order if name not in maps]:
                 match = _match(signals[a], signals[b], max_rate)
                 if match is not None:
-                    known, scale = maps[a], 1 / (1 + match.rate)
-                    shift_s = (1 + known.rate) * scale * match.shift_s
+                    (shift_s, rate), known = match.tolist(), maps[a]
+                    scale = 1 / (1 + rate)
+                    shift_s *= (1 + known.rate) * scale
                     maps[b] = ClockMap(known.offset_s - shift_s, (1 + known.rate) * scale - 1)
                     reached.append(b)
     return maps
@@ -220,9 +212,9 @@ def _relative_to_most(maps: dict[str, ClockMap]) -> dict[str, ClockMap]:
     }
 
 
-def _match(a: _Signal, b: _Signal, max_rate: float) -> _Match | None:
-    """The shift and the rate under which two cameras show the same motion; None unless they explain it far better than
-    any others.
+def _match(a: _Signal, b: _Signal, max_rate: float) -> Array | None:
+    """The shift and the rate (2,) under which two cameras show the same motion; None unless they explain it far better
+    than any others. The stamp of b that belongs to a stamp t of a is t (1 + rate) + shift.
 
     Affine cameras propose: the largest canonical correlations over all shifts, and rates up to `max_rate`. Perspective
     decides: at the right shift and rate, one epipolar geometry fits all images to their noise.
@@ -252,10 +244,10 @@ def _match(a: _Signal, b: _Signal, max_rate: float) -> _Match | None:
     same_rate = geometry.with_same_rate(found)
     by_rate = geometry.gain(found, same_rate)
     if by_rate < MARGIN:
-        return _Match(*same_rate.tolist())
+        return same_rate
     halves = geometry.halves(found)
     jumped = sum(half.gain(half.with_same_rate(found), found) for half in halves)
-    return _Match(*found.tolist()) if jumped < MARGIN and by_rate > LEAD else None
+    return found if jumped < MARGIN and by_rate > LEAD else None
 
 
 def _propose(trials: Sequence[tuple[Array, Array, float]], apart_s: float, apart: float) -> Array:

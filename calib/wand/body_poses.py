@@ -28,7 +28,7 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.foundation.columns import Columns
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import invert, rotation_from_vector, skew, vector_from_rotation
+from camera_node.geometry.pose import invert, motion_from, rotation_from_vector, skew, vector_from_rotation
 
 MAX_VIEW = 32  # of a view, that are used to locate it
 SIGMA_RAD = 1.5e-3  # of a ray to a marker by a rough rig: 3 px of a lens of 2000 px
@@ -495,11 +495,7 @@ def _ransac(images: _Images) -> Array | None:
         )
     except cv2.error:
         return None
-    if not found:
-        return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    return T
+    return motion_from(turn, shift) if found else None
 
 
 def _refine_camera(images: _Images, T: Array, sigma: Array | float) -> Array | None:
@@ -516,6 +512,5 @@ def _refine_camera(images: _Images, T: Array, sigma: Array | float) -> Array | N
             cv2.Rodrigues(T[:3, :3])[0],
             T[:3, 3:].copy(),
         )
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+        T = motion_from(turn, shift)
     return T if np.isfinite(T).all() else None

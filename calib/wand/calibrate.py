@@ -38,7 +38,7 @@ from calib.wand.detections import (
     count_frames,
     gather_background,
 )
-from calib.wand.focal_lengths import has_unknown, with_rough_focal_lengths
+from calib.wand.focal_lengths import with_rough_focal_lengths
 from calib.wand.initial_rig import (
     InitialRig,
     TwoViewGeometry,
@@ -335,13 +335,13 @@ def _solve_without_exchanged(
     for _ in range(MAX_EXCHANGE_PASSES):
         if solution.adjusted.used.mean() > 1 - MIN_REJECTED and not recording.timing.synchronous:
             break
-        found = find_exchanges(placement.recording, solution.adjusted, solution.observations)
-        if found is None:
+        pairs, right = find_exchanges(placement.recording, solution.adjusted, solution.observations)
+        if not pairs:
             break
-        shares.update({(pair.shown, pair.of): pair.share for pair in found.pairs})
+        shares.update({(pair.shown, pair.of): pair.share for pair in pairs})
         placed = [recording.names.index(name) for name in placement.recording.names]
         mine = np.flatnonzero(np.isin(recording.detections.camera, placed))
-        recording = recording.select(mine[found.tested & ~found.wrong])
+        recording = recording.select(mine[right])
         placement, solution = _solve_majority(recording, distance)
     exchanges = tuple(Exchange(*names, share) for names, share in shares.most_common())
     return replace(placement, exchanges=exchanges), solution
@@ -509,14 +509,10 @@ def _prepare_fine(
 
 
 def _adjust_finely(fine: Estimate, inflation: float) -> Solution:
-    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these.
-
-    With unknown lenses the start is kept: the optimum of path and lenses together may be far away.
-    """
-    is_rough = has_unknown(fine.problem.lenses)
-    first = adjust(fine.problem, fine.observations, fine.state, rounds=1, profiled=is_rough)
+    """Adjust once with usual lens priors, estimate the lens priors from that, and adjust with these."""
+    first = adjust(fine.problem, fine.observations, fine.state, rounds=1)
     problem = estimate_lens_priors(fine.problem, replace(first, inflation=inflation))
-    return Solution(adjust(problem, fine.observations, first.state, profiled=True), fine.observations)
+    return Solution(adjust(problem, fine.observations, first.state), fine.observations)
 
 
 def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: WandObservations) -> None:

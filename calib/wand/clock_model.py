@@ -108,7 +108,7 @@ def with_readout_times(adjusted: Adjusted, observations: WandObservations, timin
         return adjusted
     clocks = adjusted.state.clocks.copy()
     clocks[cameras, 2] = readout_s
-    found = adjust(problem, observations, replace(adjusted.state, clocks=clocks), profiled=True)
+    found = adjust(problem, observations, replace(adjusted.state, clocks=clocks))
     found = replace(found, inflation=inflation_factor(found))
     return found if _has_readout(found.state.clocks[cameras, 2], found, timing) else adjusted
 

@@ -36,9 +36,8 @@ UNREAD = np.array(np.nan, "<f4").tobytes()  # in the column `id_probability`: no
 FOREIGN = -2  # label of a roundel with the code of another object
 MAX_GAP_PERIODS, MAX_GAP_S = 2.5, 0.5  # longest interpolation of a track: frame periods, and seconds
 MAX_SPREAD_S = 0.1  # a hand moves decimetres in this time
-MIN_SPREAD_S = (
-    0.02  # frames this close form one set at any frame rate: the motion between them is interpolated
-)
+# Frames this close form one set at any frame rate: the motion between them is interpolated
+MIN_SPREAD_S = 0.02
 # Share of each camera's frames that share a stamp with another camera, from which cameras may be synchronous. Stamps of
 # free-running cameras, rounded to milliseconds, coincide by chance for 40 % of the frames of eight cameras at 60 Hz.
 MIN_COINCIDENT = 0.8

@@ -29,9 +29,8 @@ from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import rotation_from_vector, skew
 from camera_node.protocol.messages import Detections
 
-GRID = (
-    9  # of a grid, within two standard deviations: a quarter apart, where lenses are known by a factor of two
-)
+# Of a grid, within two standard deviations: a quarter apart, where lenses are known by a factor of two
+GRID = 9
 SAMPLE = 150  # correspondences of a pair
 PARTNERS = 4  # of a camera, those with most frame sets in common: more change no start
 SINGULAR = np.diag([1.0, 1.0, 0.0])  # values of an essential matrix

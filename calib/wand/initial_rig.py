@@ -36,7 +36,7 @@ from calib.wand.detections import (
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import invert
+from camera_node.geometry.pose import invert, motion_from
 
 MIN_FRAME_SETS = 8  # that two cameras must share
 FEW = 4  # markers of a wand, up to which all orders of their numbers are tried: 23
@@ -232,11 +232,9 @@ class TwoViewGeometry:
         if E is None or E.shape != (3, 3):
             return None
         _, R, t, mask = cv2.recoverPose(E, xy_a, xy_b, K, mask=mask)[:4]
-        T_b_a = np.eye(4)
-        T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
         distances = sampson(np.asarray(E, float), xy_a, xy_b)
         return _RelativePose(
-            matches, invert(T_b_a), mask.ravel() > 0, float(np.quantile(distances, QUANTILE))
+            matches, invert(motion_from(R, t)), mask.ravel() > 0, float(np.quantile(distances, QUANTILE))
         )
 
     def _count_frames(self, rows: Index) -> int:

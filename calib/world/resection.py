@@ -20,13 +20,12 @@ from calib.rig.estimation import MARGIN, STEPS
 from calib.world.landmarks import FIT_PX
 from calib.world.still_roundels import StillRoundel
 from camera_node.foundation.arrays import Array, Index
-from camera_node.geometry.pose import Pose, invert, rotation_from_vector, vector_from_rotation
+from camera_node.geometry.pose import Pose, invert, motion_from, rotation_from_vector, vector_from_rotation
 
 SIGMA_PX = 0.2  # of a mean centre: the centre of the ellipse is not exactly that of the disc
 MAX_ASSIGNMENTS = 20_000  # of three roundels to three points: a few seconds
-MAX_MISS = (
-    0.05  # RMS distance of the points from their rays over their extent: beyond, names or units are wrong
-)
+# RMS distance of the points from their rays over their extent: beyond, names or units are wrong
+MAX_MISS = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +127,7 @@ def _three_point_poses(rays: Array, places: Array) -> Iterator[Array]:
         places[:, None], rays[:, None, :2], np.eye(3), np.empty(0), flags=cv2.SOLVEPNP_AP3P
     )
     for k in range(count):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_from_vector(turns[k].ravel()), shifts[k].ravel()
+        T = motion_from(turns[k], shifts[k])
         if np.isfinite(T).all():
             yield T
 

@@ -95,6 +95,15 @@ def rotation_with_z(z: ArrayLike) -> Array:
     return np.stack([np.cross(y, z), y, z], axis=-1)
 
 
+def motion_from(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """The (4, 4) rigid motion by a rotation, a matrix (3, 3) or a vector of three numbers, and a translation of three
+    numbers, as OpenCV returns them."""
+    R, T = np.asarray(rotation, float), np.eye(4)
+    T[:3, :3] = R if R.shape == (3, 3) else rotation_from_vector(R.ravel())
+    T[:3, 3] = np.ravel(translation)
+    return T
+
+
 def invert(T: Array) -> Array:
     """The inverse of a (4, 4) rigid motion."""
     inverse = np.eye(4)

@@ -41,7 +41,7 @@ from calib.wand.bundle_adjustment.residuals import (
     point_error_norms,
     reprojection_errors,
 )
-from camera_node.foundation.arrays import Array, Index, Mask
+from camera_node.foundation.arrays import Array, Index
 
 # Cholesky factors and triangular solutions, without the checks of NumPy and SciPy, which take longer than these.
 [potrf], [trsm] = get_lapack_funcs(["potrf"]), get_blas_funcs(["trsm"])
@@ -71,26 +71,24 @@ def adjust(
     observations: WandObservations,
     start: State,
     rounds: int = MAX_ROUNDS,
-    profiled: bool = False,
 ) -> Adjusted:
     """Optimize from a start that is nearly right, without outliers, and prepare the covariance.
 
     Each round rejects observations, and interrupts the motion prior, by the statistics of the residuals, and optimizes;
-    rounds end where these do not change. A `profiled` start is the optimum of another adjustment of the same motion.
+    rounds end where these do not change.
     """
-    optimum = _optimize_exactly(problem, observations, start, rounds, profiled)
-    state, inliers, weights = optimum.state, observations.select(optimum.used), optimum.weights
+    state, choice, weights = _optimize_exactly(problem, observations, start, rounds)
+    inliers = observations.select(choice.observations)
     cameras = profile_motion(linearize(problem, inliers, state, weights))
     return Adjusted(
         problem=problem,
         state=state,
-        used=optimum.used,
+        used=choice.observations,
         residuals=reprojection_errors(problem, observations, state),
         scale=_noise_scale(problem, inliers, state, weights),
         information=cameras.information,
         scores=cameras.scores,
-        iterations=optimum.iterations,
-        background_used=optimum.weights.background,
+        background_used=choice.background,
     )
 
 
@@ -107,25 +105,15 @@ def with_information(adjusted: Adjusted, problem: Problem, observations: WandObs
 
 def optimize(problem: Problem, observations: WandObservations, start: State) -> State:
     """Optimize from the optimum for more observations of the same motion, without those that it rejects."""
-    return _optimize_exactly(problem, observations, start, rounds=1, profiled=True).state
-
-
-@dataclass(frozen=True, slots=True)
-class _Optimum:
-    """The optimal state, the observations (n,) that it is adjusted to, their weights, and the iterations it took."""
-
-    state: State
-    used: Mask
-    weights: Weights
-    iterations: int
+    return _optimize_exactly(problem, observations, start, rounds=1)[0]
 
 
 def _optimize_exactly(
-    problem: Problem, observations: WandObservations, state: State, rounds: int, profiled: bool
-) -> _Optimum:
-    """Optimize in rounds; where the cameras of the start are not `profiled`, the first begins with the common optimum
-    of cameras and motion, which is reached from farther away."""
-    iterations, none = 0, np.zeros(len(observations), bool)
+    problem: Problem, observations: WandObservations, state: State, rounds: int
+) -> tuple[State, Choice, Weights]:
+    """The optimal state, what it is adjusted to, and the weights of that, in rounds; where the motion can't be profiled
+    out at once, from the common optimum of cameras and motion, which is reached from farther away."""
+    none = np.zeros(len(observations), bool)
     choice = Choice(none, np.zeros(len(problem.knot_s) - 1, bool), np.zeros(len(problem.background.uv), bool))
     for _ in range(rounds):
         weights = find_weights(problem, observations, state)
@@ -135,14 +123,14 @@ def _optimize_exactly(
         choice = better
         objective = _Objective(problem, observations.select(choice.observations), weights.select(choice))
         state = locate_points(problem, state, choice.background)
-        found = _profile(objective, state) if profiled else None
+        found = _profile(objective, state)
         if found is None:
-            state, more, _ = _levenberg_marquardt(objective, state)
-            iterations, found = iterations + more, _profile(objective, state)
-        profiled, state = found is not None, state if found is None else found
+            state, _ = _levenberg_marquardt(objective, state)
+            found = _profile(objective, state)
+        state = state if found is None else found
     else:
         weights = find_weights(problem, observations, state)
-    return _Optimum(state, choice.observations, weights.select(choice), iterations)
+    return state, choice, weights.select(choice)
 
 
 def _choose(
@@ -210,12 +198,11 @@ class _Step:
 
 def _levenberg_marquardt(
     objective: _Objective, state: State, damping: float = START_DAMPING, robust: bool = False
-) -> tuple[State, int, float]:
-    """The optimum, the number of iterations and the last damping, from the `damping` of the step before; where
-    `robust`, Cauchy's scale follows the residuals."""
-    norms, iterations = objective.norms(state), 0
-    while iterations < MAX_ITERATIONS:
-        iterations += 1
+) -> tuple[State, float]:
+    """The optimum and the last damping, from the `damping` of the step before; where `robust`, Cauchy's scale follows
+    the residuals."""
+    norms = objective.norms(state)
+    for _ in range(MAX_ITERATIONS):
         if robust:
             scale = CAUCHY_SCALE * max(coordinate_sigma(norms.observation), 1.0)
             objective = replace(objective, observation_scale=scale, interval_scale=CAUCHY_SCALE)
@@ -227,7 +214,7 @@ def _levenberg_marquardt(
         tolerance = ROBUST_TOLERANCE if robust else TOLERANCE
         if before.cost - step.cost < tolerance * before.cost + ABSOLUTE_TOLERANCE:
             break
-    return state, iterations, damping
+    return state, damping
 
 
 def _profile(objective: _Objective, state: State) -> State | None:
@@ -244,7 +231,7 @@ def _profile(objective: _Objective, state: State) -> State | None:
     most, before, damping = len(objective.observations) ** -0.25, 1.0, START_DAMPING  # two residuals each
     for _ in range(MAX_ITERATIONS):
         try:
-            state, _, damping = _levenberg_marquardt(path, state, damping)
+            state, damping = _levenberg_marquardt(path, state, damping)
             norms = objective.norms(state)
             profiled = profile_motion(objective.linearize(state, norms))
             steps = profiled.step(objective.problem, state, damping)
@@ -520,7 +507,7 @@ class _Sums:
         gradient[:-1] += motion[:, :h, -1]
         gradient[1:] += motion[:, h:, -1]
         crossed, scores = _sum_cameras(system, local)
-        beside = system.background.scores[:, estimated].reshape(len(system.background.scores), size)
+        beside = system.point_scores[:, estimated].reshape(len(system.point_scores), size)
         return cls(
             motion=BlockTridiagonal.of_chain(motion[:, :, :-1]),
             gradient=gradient,
@@ -565,7 +552,7 @@ def _sum_camera_hessians(system: LinearSystem, local: int) -> Array:
     """(S, d, S, d) Hessian of the cameras, with background points, without priors."""
     estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
     of_row = np.repeat(system.views % len(system.problem.lenses), np.diff(system.bounds))
-    own = system.background.information[np.ix_(estimated, range(d), estimated, range(d))]
+    own = system.by_points[np.ix_(estimated, range(d), estimated, range(d))]
     for k, camera in enumerate(estimated):
         J = system.rows[of_row == camera, local:-1]
         own[k, :, k] += J.T @ J

@@ -292,7 +292,6 @@ class Adjusted:
         information: (S d, S d) of the S estimated cameras' free parameters at the assumed noise, with priors. Its null
             space is the gauge: the choice of the world, and of the time that clocks are relative to.
         scores: (L + J, S d) gradients by interval between knots, then by background point, without priors.
-        iterations: of all rounds.
         background_used: images of background points that were not rejected.
         inflation: factor of the covariance for residuals that are correlated in time.
     """
@@ -304,7 +303,6 @@ class Adjusted:
     scale: float
     information: Array
     scores: Array
-    iterations: int
     background_used: Mask
     inflation: float = 1.0
 

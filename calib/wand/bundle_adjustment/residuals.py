@@ -259,19 +259,6 @@ def error_norms(
 
 
 @dataclass(frozen=True, slots=True)
-class PointInformation:
-    """Information of all background points on the cameras' d free parameters, the points eliminated.
-
-    Attributes:
-        information: (C, d, C, d).
-        scores: (J, C, d) gradients by point.
-    """
-
-    information: Array
-    scores: Array
-
-
-@dataclass(frozen=True, slots=True)
 class LinearSystem:
     """The linear least-squares system for a step from a state.
 
@@ -286,7 +273,8 @@ class LinearSystem:
         motion_prior: (L, 12 B + 1, 12 B + 1) the part of `chain` from the prior of the motion: constant velocity and
             zero speed.
         priors: of the cameras.
-        background: information of the background points on the cameras.
+        by_points, point_scores: (C, d, C, d) information of all background points on the cameras, and (J, C, d)
+            gradients by point, the points eliminated.
     """
 
     problem: Problem
@@ -296,7 +284,8 @@ class LinearSystem:
     chain: Array
     motion_prior: Array
     priors: list[CameraPrior]
-    background: PointInformation
+    by_points: Array
+    point_scores: Array
 
 
 def linearize(
@@ -314,6 +303,7 @@ def linearize(
     order = np.argsort(view, kind="stable")
     first = np.flatnonzero(np.diff(view[order], prepend=-1))
     motion_prior = _linearize_prior(problem, state, weights)
+    by_points, point_scores = eliminate_points(problem, state, weights.background)
     return LinearSystem(
         problem,
         views=view[order][first],
@@ -322,7 +312,8 @@ def linearize(
         chain=motion_prior + _linearize_lengths(problem, state),
         motion_prior=motion_prior,
         priors=camera_priors(problem, state),
-        background=eliminate_points(problem, state, weights.background),
+        by_points=by_points,
+        point_scores=point_scores,
     )
 
 
@@ -436,12 +427,12 @@ def accept_images(problem: Problem, norms: Array, limit: float) -> Mask:
     return accepted & (count >= 2)[problem.background.point]
 
 
-def eliminate_points(problem: Problem, state: State, used: Mask) -> PointInformation:
-    """Eliminate the points from the images `used` (n,)."""
+def eliminate_points(problem: Problem, state: State, used: Mask) -> tuple[Array, Array]:
+    """`LinearSystem.by_points` and `point_scores` from the images `used` (n,)."""
     C, d, n = len(problem.lenses), len(problem.free), len(problem.background)
     own, scores, crossed = np.zeros((C, d, C, d)), np.zeros((n, C, d)), np.zeros((n, C, 3, d))
     if not used.any():
-        return PointInformation(own, scores)
+        return own, scores
     point, camera = problem.background.point[used], problem.background.camera[used]
     error, J_camera, J_point = (part[used] for part in _linearize_images(problem, state))
     for c in range(C):
@@ -454,7 +445,7 @@ def eliminate_points(problem: Problem, state: State, used: Mask) -> PointInforma
     response = np.linalg.solve(H, crossed)
     lost = crossed.reshape(3 * n, -1).T @ response.reshape(3 * n, -1)
     along = (g[:, None] @ response)[:, 0]
-    return PointInformation(own - lost.reshape(own.shape), scores - along.reshape(scores.shape))
+    return own - lost.reshape(own.shape), scores - along.reshape(scores.shape)
 
 
 def _point_equations(n: int, point: Index, error: Array, J: Array, weight: Array) -> tuple[Array, Array]:

@@ -263,24 +263,11 @@ def _rms(values: Array) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-@dataclass(frozen=True, slots=True)
-class FoundExchanges:
-    """Detections under the wrong camera.
-
-    Attributes:
-        pairs: who shows whose points, the most frequent first.
-        tested, wrong: (n,) detections of the recording that were tested, and those under the wrong camera.
-    """
-
-    pairs: list[Exchange]
-    tested: Mask
-    wrong: Mask
-
-
 def find_exchanges(
     recording: WandRecording, adjusted: Adjusted, observations: WandObservations
-) -> FoundExchanges | None:
-    """Find the detections of a recording that are under the wrong camera; None where there are few or none."""
+) -> tuple[list[Exchange], Mask]:
+    """Find the detections of a recording that are under the wrong camera: who shows whose points, the most frequent
+    first, where these are not few; and (n,) the detections that were tested and are under the right one."""
     count = len(recording.detections)
     tested, owner = np.zeros(count, bool), recording.detections.camera.copy()
     if recording.timing.synchronous:
@@ -290,9 +277,7 @@ def find_exchanges(
         tested[observations.row] = True
         rows, owners = _compare_with_motion(recording, adjusted, observations)
     owner[rows] = owners
-    wrong = owner != recording.detections.camera
-    pairs = _count_exchanges(recording, tested, owner)
-    return FoundExchanges(pairs, tested, wrong) if pairs else None
+    return _count_exchanges(recording, tested, owner), tested & (owner == recording.detections.camera)
 
 
 def _count_exchanges(recording: WandRecording, tested: Mask, owner: Index) -> list[Exchange]:

@@ -27,7 +27,7 @@ from calib.wand.quality.checks import (
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import invert, vector_from_rotation
+from camera_node.geometry.pose import invert, motion_from, vector_from_rotation
 
 SEPARATED = 0.8  # nine of ten on either side of a time: the share before it less the other one
 HALF = 0.5  # of a camera's contradicting detections, that a second pose must explain
@@ -153,7 +153,7 @@ def _explain_motion(
     )
     if not fitted or inliers is None or len(inliers) < max(MIN_COUNT, HALF * len(rows)):
         return 0, ""
-    there = invert(_pose(np.asarray(turn, float), np.asarray(shift, float)))
+    there = invert(motion_from(turn, shift))
     apart = np.linalg.norm(there[:3, 3] - camera[:3, 3])
     turned = np.degrees(np.linalg.norm(vector_from_rotation(there[:3, :3] @ camera[:3, :3].T)))
     t_s, fitting = recording.detections.t_s, rows[np.asarray(inliers, np.intp).ravel()]
@@ -166,12 +166,6 @@ def _explain_motion(
         "the parts of the recording before and after that on their own, or leave the camera out. Did nothing move? A "
         "wand that is seen from its other side from then on needs thickness_m in its file"
     )
-
-
-def _pose(turn: Array, shift: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    return T
 
 
 def _separate(first: Array, second: Array) -> tuple[float, bool]:

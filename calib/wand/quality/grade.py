@@ -25,17 +25,14 @@ from camera_node.geometry.pose import invert
 GRADES = "ABCD"
 # Largest value for A, B and C; a larger one is D.
 LIMITS = {
-    "residual_px": (
-        0.3,
-        0.7,
-        1.5,
-    ),  # sharp images and a good lens; webcams with motion blur; wrong intrinsics
+    # Of sharp images and a good lens; of webcams with motion blur; of wrong intrinsics.
+    "residual_px": (0.3, 0.7, 1.5),
     "rejected": (0.05, 0.1, 0.25),  # part of the marker centres
     "pose_px": (
         0.1,
         0.3,
         1.0,
-    ),  # image error by the camera's own covariance; 0.1 px is the noise of a roundel
+    ),  # image error by the camera's own covariance; the noise of a roundel is 0.1 px
     "unused": (0.5, 0.7, 0.85),  # part of the image area shared with other cameras
     "length": (0.002, 0.005, 0.02),  # relative mean error of the wand's length
     "held_out": (5e-4, 1e-3, 3e-3),  # distance of held-out markers from the viewing rays, of their distance
