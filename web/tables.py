@@ -69,8 +69,11 @@ def _robot_note(state: ArenaState, name: str) -> str:
     if status is None:
         return ""
     notes = [status.not_acquired.get(name, "")]
-    if misfit_px := status.geometry_residuals_px.get(name):
-        notes.append(f"the markers differ from their definition by {misfit_px:.1f} px: measure them again")
+    for found in status.contradictions:
+        if found.kind == "robot" and name in found.names:
+            notes.append(
+                f"the markers differ from their definition by {found.size_mm:.1f} mm: measure them again"
+            )
     if diameter_m := status.measured_diameters_m.get(name):
         notes.append(f"its discs measure {1e3 * diameter_m:.0f} mm, not as declared: define it again")
     if name in status.unsaved_robots:

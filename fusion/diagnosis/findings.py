@@ -221,13 +221,6 @@ def check_arena(observation: Observation, now: datetime) -> Iterator[Finding]:
     for name, cause in status.not_acquired.items():
         if name not in status.robots:
             yield Finding("warning", f"robot {name}", "never found", cause)
-    for name, residual in status.geometry_residuals_px.items():
-        yield Finding(
-            "warning",
-            f"robot {name}",
-            f"its markers are {residual:.1f} px from their places",
-            "measure it again",
-        )
     for contradiction in status.contradictions:
         state, remedy = describe_contradiction(contradiction).rsplit("; ", 1)
         yield Finding("warning", "claims", state, remedy)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Decides which frames of which cameras are used: clocks, frozen images, frames that contradict, moved cameras."""
+"""Decides which frames of which cameras are used: clocks, frozen images, moved cameras."""
 
 from dataclasses import replace
 
@@ -9,7 +9,6 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import Snapshot
 from fusion.monitoring.camera_clocks import CameraClocks, uncertain
-from fusion.monitoring.frame_consistency import FrameConsistency
 from fusion.monitoring.frozen_images import FrozenImages
 from fusion.rig_graph.rig_monitor import RigMonitor
 
@@ -26,7 +25,6 @@ class CameraMonitors:
         self._cameras = cameras
         self.clocks = CameraClocks(cameras.names)
         self.frozen = FrozenImages(cameras, markers)
-        self.consistency = FrameConsistency(cameras, markers)
         self.rig = RigMonitor(cameras, markers)
 
     @property

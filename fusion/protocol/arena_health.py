@@ -64,10 +64,6 @@ def assess_health(status: FusionStatus, rig: Rig | None, now: datetime) -> Arena
     never = {name: cause for name, cause in status.not_acquired.items() if name not in status.robots}
     problems += [f"robot {name} was never found: {cause}" for name, cause in never.items()]
     problems += [
-        f"robot {name}: its markers are not where robots.yaml has them ({residual:.1f} px)"
-        for name, residual in status.geometry_residuals_px.items()
-    ]
-    problems += [
         f"robot {name}: its discs measure {1e3 * diameter_m:.0f} mm, not as declared"
         for name, diameter_m in status.measured_diameters_m.items()
     ]
@@ -115,8 +111,7 @@ def describe_contradiction(contradiction: Contradiction) -> str:
         cause = "it was moved, or its lens or clock changed"
         return f"camera {names} contradicts the other cameras {size}: {cause}; calibrate it again"
     if contradiction.kind == "robot":
-        cause = "a marker was displaced, or robots.yaml does not have their places"
-        return f"robot {names}: its markers contradict each other {size}: {cause}; measure it again"
+        return f"robot {names}: its markers are not where robots.yaml has them, {size}; measure it again"
     cause = "which one is wrong is undecided, or the lenses or the wand's lengths are"
     return f"cameras {names} contradict each other {size}: {cause}; calibrate again"
 

@@ -356,7 +356,6 @@ class FusionStatus(msgspec.Struct, frozen=True, kw_only=True):
     robots: dict[str, TrackingState]
     faults: dict[str, int]
     limits: Limits | None = None  # with which the server tracks, for a replay
-    geometry_residuals_px: dict[str, float] = {}  # RMS of robots whose markers are not at the declared places
     measured_diameters_m: dict[str, float] = {}  # of the discs of robots that declare another diameter
     not_acquired: dict[str, str] = {}  # why, by robot
     contradictions: tuple[Contradiction, ...] = ()  # of residuals to their claims

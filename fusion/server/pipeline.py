@@ -254,7 +254,6 @@ class TrackingPipeline:
             excluded=frozenset(tracker.monitors.rig.excluded),
             frozen=frozenset(tracker.monitors.frozen.names),
             clocks=tracker.monitors.clocks.health(),
-            geometry_residuals_px=tracker.geometry.misfits(),
             measured_diameters_m=tracker.sizes.misfits(),
             not_acquired=tracker.not_acquired(),
             contradictions=tracker.monitors.rig.contradictions() or tracker.claims.contradictions(),

@@ -41,7 +41,6 @@ class PipelineStatus:
         excluded: cameras that were moved, whose detections are excluded.
         frozen: cameras that repeat an old image.
         clocks: of the cameras, by name.
-        geometry_residuals_px: RMS of robots whose markers are not at the declared places.
         measured_diameters_m: of the discs of robots that declare another diameter.
         not_acquired: why robots were not acquired, by name.
         contradictions: of residuals to their claims.
@@ -55,7 +54,6 @@ class PipelineStatus:
     excluded: frozenset[str] = frozenset()
     frozen: frozenset[str] = frozenset()
     clocks: dict[str, ClockHealth] = field(default_factory=dict)
-    geometry_residuals_px: dict[str, float] = field(default_factory=dict)
     measured_diameters_m: dict[str, float] = field(default_factory=dict)
     not_acquired: dict[str, str] = field(default_factory=dict)
     contradictions: tuple[Contradiction, ...] = ()
@@ -228,7 +226,6 @@ class ServerStatistics:
             robots=dict(self._robots),
             faults=faults,
             limits=pipeline.limits,
-            geometry_residuals_px=pipeline.geometry_residuals_px,
             measured_diameters_m=pipeline.measured_diameters_m,
             not_acquired=pipeline.not_acquired,
             contradictions=pipeline.contradictions,

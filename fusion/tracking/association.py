@@ -37,7 +37,6 @@ from fusion.model.observations import (
     MatchedObservations,
 )
 from fusion.model.states import States
-from fusion.monitoring.frame_consistency import AssignedFrames
 from fusion.tracking.estimator import Estimator, Prediction
 
 UNASSIGNED_COST = 1e4  # of a marker without a detection: above any sum of costs within gates
@@ -161,6 +160,23 @@ class AssociatedFrames:
     prediction: Prediction
     tracked: Mask
     association: Association
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AssignedFrames:
+    """Frames of a frame set with their assignments before the update.
+
+    Attributes:
+        states: predicted robots.
+        tracked: (R,) robots whose detections were assigned.
+        detections: of all frames.
+        assignments: of the detections.
+    """
+
+    states: States
+    tracked: Mask
+    detections: DetectionTable
+    assignments: Assignments
 
 
 def _first_rows(frames: Sequence[CalibratedFrame]) -> Index:

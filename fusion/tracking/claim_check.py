@@ -9,6 +9,7 @@ The errors of the rig are the same in all frame sets, so they do not average: th
 degrees of freedom of one pose (Satterthwaite 1946).
 """
 
+import logging
 from dataclasses import dataclass
 from itertools import compress
 from typing import Literal
@@ -25,6 +26,7 @@ from fusion.model.observations import (
     MatchedObservations,
 )
 from fusion.model.states import States
+from fusion.protocol.arena_health import describe_contradiction
 from fusion.protocol.pose_messages import Contradiction
 from fusion.tracking.estimator import Estimator, Prediction
 
@@ -34,6 +36,7 @@ CLAIM_RATIO = 1.5  # of squared errors to claims: less does not change what a cl
 FALSE_ALARM = 1e-6  # of one comparison: one in a month of ten comparisons a second
 POSE_DEGREES = 6
 MIN_REDUNDANCY = 1.0  # of a frame set: with less, everything fits
+log = logging.getLogger("fusion")
 
 
 @dataclass(slots=True)
@@ -88,13 +91,18 @@ class ClaimCheck:
 
     def __init__(self, estimator: Estimator, markers: MarkerTable, names: tuple[str, ...]) -> None:
         self._estimator, self._markers, self._names = estimator, markers, names
-        n, c = len(names), len(estimator.cameras.names)
+        self._turn = self._next = 0
+        self._reported: set[tuple[str, ...]] = set()
+        self.forget()
+
+    def forget(self) -> None:
+        """The cameras are others, or elsewhere: samples before blame robots for what a camera did."""
+        n, c = len(self._names), len(self._estimator.cameras.names)
         self._all, self._without = _Sums.zeros(n), _Sums.zeros(n, c)
         self._left_out_m2, self._left_out = np.zeros(
             (2, n, c)
         )  # errors of a camera by the others: sums, counts
         self._samples = np.zeros(n, int)
-        self._turn = self._next = 0
 
     def observe(
         self, prediction: Prediction, states: States, detections: DetectionTable, assignments: Assignments
@@ -141,7 +149,16 @@ class ClaimCheck:
             self._left_out[robot, k] += out.sum() - self._left_out[robot, k] / MEMORY
 
     def contradictions(self) -> tuple[Contradiction, ...]:
-        """What contradicts the claims: one camera, robots, or cameras of which nothing decides which one is wrong."""
+        """What contradicts the claims; logs each when it first appears."""
+        found = self._contradictions()
+        for contradiction in found:
+            if contradiction.names not in self._reported:
+                log.warning(describe_contradiction(contradiction))
+        self._reported = {contradiction.names for contradiction in found}
+        return found
+
+    def _contradictions(self) -> tuple[Contradiction, ...]:
+        """One camera, robots, or cameras of which nothing decides which one is wrong."""
         known = self._samples >= MEMORY // 2
         bad = self._all.contradicts() & known
         if not bad.any():

@@ -42,14 +42,12 @@ class ObservationSummary:
         robot_cameras: (R, C) robots and cameras.
         marker_cameras: (K, C) rows of the marker table and cameras.
         n_markers: (R,) observed markers.
-        mean_px2: (R, C) mean squared residual by robot and camera; NaN without observations.
         residual_px: (R,) RMS over all cameras; NaN without observations.
     """
 
     robot_cameras: Mask
     marker_cameras: Mask
     n_markers: Index
-    mean_px2: Array
     residual_px: Array
 
     @classmethod
@@ -66,17 +64,12 @@ class ObservationSummary:
         robot, camera = marker_table.robot[assignments.marker], detections.camera[assignments.detection]
         marker_cameras = np.zeros((len(marker_table), n_cameras), bool)
         marker_cameras[assignments.marker, camera] = True
-        view, shape = robot * n_cameras + camera, (n_robots, n_cameras)
-        count = np.bincount(view, minlength=n_robots * n_cameras).reshape(shape)
-        squared_px2 = np.bincount(view, assignments.squared_px, n_robots * n_cameras).reshape(shape)
-        mean_px2, mean = _ratio(squared_px2, count), _ratio(squared_px2.sum(1), count.sum(1))
+        robot_cameras = np.zeros((n_robots, n_cameras), bool)
+        robot_cameras[robot, camera] = True
+        count = np.bincount(robot, minlength=n_robots)
+        mean = np.bincount(robot, assignments.squared_px, n_robots) / np.where(count, count, np.nan)
         n_markers = np.bincount(marker_table.robot[marker_cameras.any(1)], minlength=n_robots)
-        return cls(count > 0, marker_cameras, n_markers, mean_px2, np.sqrt(mean))
-
-
-def _ratio(sums: NDArray, count: Index) -> Array:
-    """Means; NaN without a summand."""
-    return sums / np.where(count, count, np.nan)
+        return cls(robot_cameras, marker_cameras, n_markers, np.sqrt(mean))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,11 +15,10 @@ from fusion.model.observations import Assignments, CameraArray, DetectionTable, 
 from fusion.model.robots import Robot
 from fusion.model.states import Snapshot
 from fusion.monitoring.camera_monitors import CameraMonitors
-from fusion.monitoring.frame_consistency import AssignedFrames
-from fusion.monitoring.geometry_check import GeometryCheck, SizeCheck
+from fusion.monitoring.size_check import SizeCheck
 from fusion.protocol.pose_messages import RobotPose
 from fusion.tracking.acquisition import Acquired, Acquisition
-from fusion.tracking.association import AssociatedFrames, Association, OwnDetections
+from fusion.tracking.association import AssignedFrames, AssociatedFrames, Association, OwnDetections
 from fusion.tracking.claim_check import ClaimCheck
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.rays import Marker
@@ -101,7 +100,6 @@ class Tracker:
         self.single_view = SingleViewTracker(self.cameras, self.table.markers.radius)
         self.monitors = CameraMonitors(self.cameras, self.table.markers)
         self.claims = ClaimCheck(self.estimator, self.table.markers, self.table.names)
-        self.geometry = GeometryCheck(self.table.names, self.table.single)
         diameters = np.array([robot.diameter_m for robot in robots.values()])
         self.sizes = SizeCheck(self.table.names, diameters, self.cameras, self.table.markers)
         self.acquires_none = False
@@ -162,12 +160,10 @@ class Tracker:
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
-        detections, all_assigned = self._collect(associated, self._used(frame_set))
+        detections, all_assigned = associated.association.collect(self._used(frame_set))
         assignments = self._update_states(associated, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
-        if not (self.robust.is_doubtful or self.monitors.rig.contradicting):
-            self.geometry.note(summary.mean_px2)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
         return Update(t_ns, associated.prediction, tracked, detections, assignments, summary, poses)
@@ -187,11 +183,14 @@ class Tracker:
         corrections = self.monitors.check_extrinsics(frame_set, now, self._recalibrates, is_doubtful)
         if self.monitors.rig.is_settled and is_doubtful:
             self.robust.settle()
+        if corrections:
+            self.claims.forget()
         return corrections
 
     def place(self, name: str, camera: Camera, pinned: bool = False) -> None:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
         self.monitors.place(name, camera, pinned)
+        self.claims.forget()
 
     def with_robots(self, robots: dict[str, Robot], renamed: dict[str, str]) -> "Tracker":
         """A tracker of other robots with the same cameras; robots with unchanged markers continue.
@@ -217,20 +216,6 @@ class Tracker:
     def _used(self, frame_set: FrameSet) -> FrameSet:
         is_known = not any(frame.clock_sigma_s for frame in frame_set.frames)
         return self.monitors.used(frame_set, 0.0 if is_known else self.table.speed_m_s)
-
-    def _collect(
-        self, associated: AssociatedFrames, frame_set: FrameSet
-    ) -> tuple[DetectionTable, Assignments]:
-        """Detections and assignments of the frames that do not contradict the tracked robots."""
-        association = associated.association
-        detections, assignments = association.collect(frame_set)
-        states, tracked = associated.prediction.states, associated.tracked
-        given = AssignedFrames(states, tracked, detections, assignments)
-        wrong = set(self.monitors.consistency.contradicting(given).tolist())
-        if not wrong:
-            return detections, assignments
-        frames = tuple(frame for k, frame in enumerate(frame_set.frames) if k not in wrong)
-        return association.collect(FrameSet(frame_set.t_ns, frames))
 
     def _claim(self) -> None:
         """State the covariances of the robots with the errors of the cameras."""

@@ -49,6 +49,7 @@ REPORTS = (
     "its clock",
     "its markers",
     "its discs",
+    "contradicts the other",
     UNDECIDED,
 )
 

@@ -15,6 +15,7 @@ from camera_node.protocol.messages import CameraStatus, Detections, Keys, encode
 from camera_node.protocol.session import listening_endpoints, open_router
 from fusion.protocol.pose_messages import (
     CameraHealth,
+    Contradiction,
     FusionStatus,
     Latency,
     Markers,
@@ -96,7 +97,9 @@ class ArenaMessages:
         message = Detections.pack(roundels, camera=name, seq=0, t_ns=time.time_ns(), width=640, height=480)
         self.put(self.keys.detections(name), encode(message))
 
-    def status(self, cameras: tuple[str, ...] = ("north",), misfits: dict[str, float] | None = None) -> None:
+    def status(
+        self, cameras: tuple[str, ...] = ("north",), contradictions: tuple[Contradiction, ...] = ()
+    ) -> None:
         health = CameraHealth(
             fps=29.97, lateness_ms=5.1, residual_px=0.08, assigned=200, unassigned=3, late=1, calibrated=True
         )
@@ -109,7 +112,7 @@ class ArenaMessages:
             cameras=dict.fromkeys(cameras, health),
             robots={"rover": "tracked"},
             faults={"camera unknown": 4},
-            geometry_residuals_px=misfits or {},
+            contradictions=contradictions,
             rig_t_ns=self.rig_t_ns,
         )
         self.put(self.keys.fusion_status, encode(message))

@@ -10,7 +10,7 @@ import numpy as np
 from calib.rig.coverage import cell_centres
 from calib.rig.rig import Rig
 from camera_node.protocol.messages import CameraStatus
-from fusion.protocol.pose_messages import CameraHealth, FusionStatus
+from fusion.protocol.pose_messages import CameraHealth, Contradiction, FusionStatus
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.colours import css, robot_colour
@@ -106,13 +106,14 @@ def test_names_are_escaped():
 
 
 def test_a_robot_with_misplaced_markers_has_a_note(arena: LiveArena, feed: Feed):
-    """The row is a warning with the difference in pixels."""
+    """The row is a warning with the difference."""
     arena.pose("rover", (0, 0, 0))
-    arena.status(misfits={"rover": 2.34})
+    found = Contradiction(kind="robot", names=("rover",), error_over_claim=9.0, size_mm=2.34)
+    arena.status(contradictions=(found,))
     wait_for(lambda: (x := feed.state()).poses and x.status)
     (row,) = tabulate_robots(feed.state()).rows
     assert (row.cells[1], row.level) == ("tracked", "warn")
-    assert "2.3 px" in row.note
+    assert "2.3 mm" in row.note
 
 
 def test_a_large_standard_deviation_is_short():

@@ -56,7 +56,6 @@ def join_status(own: FusionStatus, others: Sequence[FusionStatus]) -> FusionStat
         cameras={name: health for status in every for name, health in status.cameras.items()},
         robots=robots,
         faults=dict(sum((Counter(status.faults) for status in every), Counter())),
-        geometry_residuals_px={k: v for status in every for k, v in status.geometry_residuals_px.items()},
         measured_diameters_m={k: v for status in every for k, v in status.measured_diameters_m.items()},
         not_acquired={k: why for k, why in missing.items() if robots.get(k) in (None, "lost")},
         contradictions=tuple(c for status in every for c in status.contradictions),

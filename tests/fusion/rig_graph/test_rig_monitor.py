@@ -23,6 +23,7 @@ from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena
 from tests.fusion.tracks import errors
 
 DEADLINE_S = 60.0  # of a process that starts on a busy machine
+FRAMES = 170  # of each camera: 20 frame sets that are compared
 
 
 @pytest.mark.parametrize(
@@ -76,9 +77,10 @@ def test_a_misplaced_marker_is_reported_of_its_robot_and_not_of_a_camera(off_m, 
     glued = msgspec.structs.replace(TRIANGLE, markers=((x, y + off_m, z), *others))
     arena = Arena({"a": glued}, {"a": around}, sigma_px=0.1)
     tracker = Tracker(arena.cameras, {"a": TRIANGLE})
-    corrections, _ = follow(tracker, arena.frames(80))
+    corrections, _ = follow(tracker, arena.frames(FRAMES))
     assert corrections == []
-    assert (list(tracker.geometry.misfits()) == ["a"]) == reported
+    found = tracker.claims.contradictions()
+    assert [(c.kind, c.names) for c in found] == ([("robot", ("a",))] if reported else [])
     assert ("robot a" in caplog.text) == reported
 
 
