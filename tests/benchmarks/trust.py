@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Are poses that are called tracked right within their claim, whatever happens to the cameras?
-`python -m tests.benchmarks.trust [--only KIND] [--seeds N] [--cameras 3 4] [--quick]`.
+`python -m tests.benchmarks.trust [--only KIND] [--seeds N] [--cameras 3 4] [--quick]`; `--sample N` makes N runs
+that are drawn from all kinds, sizes of the ring, numbers and speeds of robots.
 
 Each run is an arena in virtual time (`VirtualArena`): the server's own steps, rings of cameras, moving robots, and one
 fault. A pose is judged by its squared position error over its claimed covariance, by 3: 1 on average if the claim is
@@ -377,6 +378,21 @@ def cases(only: str, seeds: int, cameras: Sequence[int], quick: bool) -> list[Ca
     return [case for case in found if only in case.row]
 
 
+def drawn(n: int) -> list[Case]:
+    """The first n runs of a series in which the kinds take turns and the rest is drawn, the same for any n."""
+    rng, kinds = np.random.default_rng(0), list(KINDS)
+    found = []
+    for k in range(n):
+        kind, seed = kinds[k % len(kinds)], k // len(kinds)
+        cameras, robots = int(rng.choice([3, 4, 6, 8])), int(rng.choice([1, 4, 8]))
+        speed_m_s, at_start = float(rng.choice([0.0, 0.1, 0.5, 1.0])), bool(rng.random() < 0.5)
+        at_start = at_start and kind.startswith(FROM_THE_START)
+        found.append(
+            Case(kind=kind, cameras=cameras, seed=seed, at_start=at_start, robots=robots, speed_m_s=speed_m_s)
+        )
+    return found
+
+
 def outcomes(wanted: Sequence[Case], jobs: int) -> Iterator[Outcome]:
     """Run in several processes, each with one thread; yields outcomes as they come."""
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -416,7 +432,9 @@ def report(found: Sequence[Outcome], details: bool) -> int:
         table.add_row(*row(list(group)))
     console().print(table)
     for o in found if details else ():
-        say(f"{o.case.row}, {o.case.cameras} cameras, seed {o.case.seed}: {o.report}, {o.rms_mm:.2f} mm")
+        case = o.case
+        of = f"{case.cameras} cameras, {case.robots} robots, {case.speed_m_s:g} m/s, seed {case.seed}"
+        say(f"{case.row}, {of}: {o.report}, {o.rms_mm:.2f} mm")
         for line in o.lines:
             say(f"    {line}")
     return sum(bool(o.rewritten) for o in found)
@@ -450,6 +468,7 @@ def main(
     seeds: int = 3,
     cameras: tuple[int, ...] = (3, 4, 6, 8),
     quick: bool = False,
+    sample: int = 0,
     details: bool = False,
     jobs: int = 2,
     save: Path | None = None,
@@ -461,12 +480,13 @@ def main(
         seeds: runs of each row.
         cameras: sizes of the ring.
         quick: no faults that were there before the server started.
+        sample: runs that are drawn, in place of those of a table.
         details: print what the server reported in each run.
         jobs: processes.
         save: a file for the outcomes as JSON lines.
     """
     found = []
-    wanted = cases(only, seeds, cameras, quick)
+    wanted = drawn(sample) if sample else cases(only, seeds, cameras, quick)
     for outcome in track(outcomes(wanted, jobs), "trust", len(wanted)):
         found.append(outcome)
         if save is not None:
