@@ -37,7 +37,7 @@ MAX_ITERATIONS, CONVERGED = 20, 1e-4  # relative decrease of the cost
 FIRST_DAMPING = 1e-4
 BEHIND = 1e6  # squared residual of a disc that is behind its camera
 ADEQUATE = 1.5  # ratio of the mean robust cost to that of noise, up to which a model explains the residuals
-MIN_FOR_PAIRS = 3  # cameras; of fewer, two are no minority
+MIN_FOR_PAIRS = 3  # cameras, of which two that move together look like the third: more are needed for pairs
 MAX_SUSPECTS = 4  # cameras that are combined to pairs: those that explain most alone
 # Factors of the errors that the calibration states, which one linearization compares.
 SCALES = 2.0 ** np.arange(-4, 4.25, 0.25)
@@ -141,6 +141,7 @@ class Fit:
         cost: robust sum of squares, with the priors.
         penalty: of the free parameters (Bayesian information criterion), and of the errors that a scale allows.
         errors: (C, 8) of the cameras, to be applied to `Window.T` by `retract`.
+        bodies: (B, 12) errors of the bodies, to be applied to `Window.states`.
         prior: (8 C, 8 C) information about the errors by the calibration, where they are not free.
         reduced: (8 C, 8 C + 1) normal equations of the errors by the observations, robots eliminated.
         by_camera: (N, 2, 8) whitened derivatives of the observations by the errors of their cameras.
@@ -151,6 +152,7 @@ class Fit:
     cost: float
     penalty: float
     errors: Array
+    bodies: Array
     prior: Array
     reduced: Array
     by_camera: Array
@@ -234,7 +236,7 @@ class Verdict:
         cameras: at fault; if the data do not decide, those that contradict each other; empty without a fault.
         fit: of the best hypothesis.
         misfit: mean squared residual without a fault in units of its expectation, not below 1.
-        scale: of the errors that the calibration states, without a fault of single cameras: the most likely one.
+        scale: of the errors that the calibration states, if no single camera is at fault: the most likely one.
     """
 
     cause: Cause | None
@@ -269,8 +271,8 @@ def judge(window: Window, starts: Array) -> Verdict:
     scaled = _scaled(window, none)
     if not is_contradicted(none, n):
         return Verdict(None, (), none, scale=scaled.hypothesis.scale)
-    verdict = replace(_compare(window, [none, scaled], starts), misfit=none.misfit)
-    return verdict if verdict.cause else replace(verdict, scale=scaled.hypothesis.scale)
+    verdict = _compare(window, [none, scaled], starts)
+    return replace(verdict, misfit=none.misfit, scale=scaled.hypothesis.scale)
 
 
 def _compare(window: Window, as_stated: Sequence[Fit], starts: Array) -> Verdict:
@@ -381,7 +383,8 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
     if hypothesis.scale != 1.0:
         stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
         penalty += np.log(2 * len(at.squared)) + larger - stated
-    return Fit(hypothesis, at.cost, penalty, at.errors, at.prior, reduced, at.rows[:, :, 12:-1], at.squared)
+    found = at.errors, at.bodies, at.prior
+    return Fit(hypothesis, at.cost, penalty, *found, reduced, at.rows[:, :, 12:-1], at.squared)
 
 
 def _prior(window: Window, hypothesis: Hypothesis) -> Array:

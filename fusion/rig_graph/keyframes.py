@@ -43,6 +43,7 @@ MAX_ROBOTS = 4  # of a keyframe; the next one has others
 GATES_PX = (16.0, 10.0, 8.0, 8.0)
 FOUND = 0.8  # of the expected markers within the last gate: detections need no other assignment
 ITERATIONS = 5
+N_MEAN, N_PREDICTED = 3, 15  # moments of a mean motion, and those that show how well it predicts
 MIN_SEEN = 4  # detections of a robot in a keyframe: 8 equations of its pose, 6
 NEGLIGIBLE = 1e-6  # share of free errors, that keeps covariances of exact cameras regular
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock offset, beside what the stamps claim
@@ -83,6 +84,44 @@ class Keyframe:
     states: States
     noise: Array
     change: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """Frame sets one after the other, with the robots after the update by each."""
+
+    frame_sets: tuple[FrameSet, ...]
+    snapshots: tuple[Snapshot, ...]
+
+    def keyframe(
+        self, k: int, known: int, mean: tuple[int, int], scene: tuple[CameraArray, MarkerTable]
+    ) -> Keyframe | None:
+        """Frame set k with the robots of moment `known`, moved on by their mean motion between two moments; None
+        without robots."""
+        frame_set, first, last = self.frame_sets[k], self.snapshots[mean[0]], self.snapshots[mean[1]]
+        robots = np.flatnonzero(first.tracked & last.tracked & self.snapshots[known].tracked)[:MAX_ROBOTS]
+        if not len(robots):
+            return None
+        velocities, noise = _mean_motion(first, last, robots)
+        states = _predicted(self.snapshots[known].states.select(robots), velocities, self._seconds(known, k))
+        every = self.snapshots[known].states.with_rows(robots, states)
+        rows = np.flatnonzero(np.isin(scene[1].robot, robots))
+        views = tuple(_view(scene, frame, frame_set.t_ns, every, rows) for frame in frame_set.frames)
+        return Keyframe(frame_set.t_ns, views, robots, states, noise, 0 * noise)
+
+    def prediction_sigma(self, k: int, robots: Index) -> Array:
+        """(K, 2) of predictions from moment k to the next one, rad and m: RMS of those before, and of the poses."""
+        errors = []
+        for n in range(max(N_MEAN, k - N_PREDICTED), k):
+            velocities, _ = _mean_motion(self.snapshots[n - N_MEAN], self.snapshots[n], robots)
+            states = self.snapshots[n].states.select(robots)
+            after = self.snapshots[n + 1].states.select(robots)
+            errors.append(_predicted(states, velocities, self._seconds(n, n + 1)).minus(after)[:, :6])
+        P = np.diagonal(self.snapshots[k].states.P[robots], axis1=1, axis2=2)[:, :6]
+        return np.sqrt((np.mean(np.square(errors), axis=0) + P).reshape(-1, 2, 3).mean(2))
+
+    def _seconds(self, k: int, n: int) -> float:
+        return (self.frame_sets[n].t_ns - self.frame_sets[k].t_ns) * 1e-9
 
 
 class Keyframes:
@@ -151,13 +190,25 @@ class Keyframes:
         states = replace(now.states.select(robots), omega=mean[0], v=mean[1])
         change = np.mean((inner - mean) ** 2, axis=2).T - noise - more
         rows = np.flatnonzero(np.isin(self._markers.robot, robots))
-        views = tuple(self._view(frame, t_ns, now.states, rows) for frame in frame_set.frames)
+        scene = self._cameras, self._markers
+        views = tuple(_view(scene, frame, t_ns, now.states, rows) for frame in frame_set.frames)
         return Keyframe(t_ns, views, robots, states, noise, WIDER * change)
 
-    def _view(self, frame: CalibratedFrame, t_ns: int, states: States, rows: Index) -> FrameView:
-        markers, tau = self._markers, (frame.t_ns - t_ns) * 1e-9
-        seen = ExpectedViews.of(self._cameras, frame.camera, states, tau, (markers, rows), frame.readout_s)
-        return FrameView(frame, seen.rows, seen.points, seen.uv)
+
+def _view(
+    scene: tuple[CameraArray, MarkerTable], frame: CalibratedFrame, t_ns: int, states: States, rows: Index
+) -> FrameView:
+    (cameras, markers), tau = scene, (frame.t_ns - t_ns) * 1e-9
+    seen = ExpectedViews.of(cameras, frame.camera, states, tau, (markers, rows), frame.readout_s)
+    return FrameView(frame, seen.rows, seen.points, seen.uv)
+
+
+def _predicted(states: States, velocities: Array, dt: float) -> States:
+    """Robots after a time with these angular and linear velocities (2, K, 3)."""
+    omega, v = velocities
+    return replace(
+        states, R=rotation_from_vector(omega * dt) @ states.R, p=states.p + v * dt, omega=omega, v=v
+    )
 
 
 def _mean_motion(first: Snapshot, last: Snapshot, robots: Index) -> tuple[Array, Array]:

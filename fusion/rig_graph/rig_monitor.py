@@ -14,9 +14,10 @@ import logging
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context, parent_process
 from typing import Any, TypeVar
@@ -38,6 +39,7 @@ from fusion.rig_graph.clock_walk import ClockWalk, Departure
 from fusion.rig_graph.hypotheses import (
     CAUSES,
     FALSE_ALARM,
+    MIN_FOR_PAIRS,
     Fit,
     Hypothesis,
     Verdict,
@@ -46,7 +48,7 @@ from fusion.rig_graph.hypotheses import (
     judge,
     retract,
 )
-from fusion.rig_graph.keyframes import Keyframe, Keyframes, window_of
+from fusion.rig_graph.keyframes import N_MEAN, Keyframe, Keyframes, Moments, window_of
 
 log = logging.getLogger("fusion")
 T = TypeVar("T")
@@ -71,6 +73,7 @@ LARGE = 2.0  # factor of the rig's errors that is reported
 # Of that factor in a window that contradicts nothing: it shows a part of the arena; one in which all cameras take part
 # that contradicted each other shows that they agree again.
 FALL, AGREED_FALL = 0.5**0.125, 0.5
+REMEMBERED_NS = 4_000_000_000  # moments; a camera is judged within three seconds
 MAX_KNOWN = 4  # poses of a camera, to which it may return
 
 
@@ -101,6 +104,7 @@ class RigMonitor:
         self._given_ns = self._measured_ns = 0  # of the last keyframes of the last job, and of the walk
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._was_doubtful = False
+        self._moments: deque[tuple[FrameSet, Snapshot]] = deque()
         self._size_m = 0.0  # of what contradicts, at the robots
         self._scale = (
             1.0  # of the rig's errors, accepted; claims may count them larger while nothing is decided
@@ -186,6 +190,7 @@ class RigMonitor:
         if is_doubtful and not self._was_doubtful:
             self._forget()
         self._was_doubtful = is_doubtful
+        self._remember_moment(frame_set, now)
         is_new, kept = self._keyframes.add(frame_set, now), self._keyframes.kept
         wait_ns = SUSPICIOUS_NS if self.is_doubtful else max(CHECK_NS, self._pause_ns)
         if (
@@ -196,7 +201,7 @@ class RigMonitor:
         ):
             self._checked_ns = now.t_ns
             self._revision = self._cameras.revision
-            given = self._cameras.as_dict(), self._scale  # of this moment
+            given = self._cameras.as_dict(), self._scale, tuple(self._moments)  # of this time
             self._given_ns = kept[-1].t_ns
             job = partial(judge_latest, tuple(kept), *given, self._markers, self._measured_ns)
             self._job = _done(job) if self.executor is None else self.executor.submit(job)
@@ -330,6 +335,13 @@ class RigMonitor:
             known.append(camera.T_world_cam)
             del known[1 : 1 - MAX_KNOWN]  # never the calibration's: the others are less accurate
 
+    def _remember_moment(self, frame_set: FrameSet, now: Snapshot) -> None:
+        if len(self._cameras.names) > MIN_FOR_PAIRS + 1:  # of four cameras, one may see nothing
+            return
+        self._moments.append((frame_set, now))
+        while self._moments[0][1].t_ns < now.t_ns - REMEMBERED_NS:
+            self._moments.popleft()
+
     def _forget(self) -> None:
         """Drop the keyframes and what is judged by them."""
         self._keyframes.clear()
@@ -344,6 +356,7 @@ class RigMonitor:
         self._cameras.scale_errors(1.0)
         self._doubted.clear()
         self._clocks.clear()
+        self._moments.clear()
         self._note_undecided(())
 
 
@@ -361,19 +374,90 @@ def judge_latest(
     keyframes: Sequence[Keyframe],
     cameras: Mapping[str, Camera],
     error_scale: float,
+    moments: Sequence[tuple[FrameSet, Snapshot]],
     markers: MarkerTable,
     since_ns: int,
 ) -> Judgement | None:
     """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
-    cameras' errors is measured."""
+    cameras' errors is measured. Of three cameras one is at fault only if `moments` show it."""
     array = CameraArray(dict(cameras), error_scale)
     for n in WINDOWS:
         if n <= len(keyframes):
             window, starts = window_of(keyframes[-n:], array, markers)
             verdict = judge(window, starts)
+            if (
+                verdict.cause == "pose"
+                and len(_seeing(window)) <= MIN_FOR_PAIRS
+                and not _moved_alone(Moments(*zip(*moments, strict=True)), (array, markers), window, verdict)
+            ):
+                verdict = replace(verdict, cause=None, cameras=tuple(np.unique(window.camera).tolist()))
             if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict, _measure(window, verdict, keyframes[-n:], since_ns)
     return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Explained:
+    """A frame set by two poses of a camera: the robots by the new one, and how much more that one explains."""
+
+    keyframe: Keyframe
+    moved: Fit
+    gain: float
+
+
+def _moved_alone(
+    moments: Moments, scene: tuple[CameraArray, MarkerTable], window: Window, verdict: Verdict
+) -> bool:
+    """Whether one of three cameras moved from one moment to the next, while the robots were where they are predicted.
+
+    If the two others had moved together, all images of robots and cameras would be the same, but the robots would
+    have jumped with these. A motion without such a moment shows nothing.
+    """
+    (camera,), limit = verdict.cameras, chdtri(CAUSES["pose"].stop, FALSE_ALARM)
+    T = window.T.copy()
+    T[camera] = retract(window.T, verdict.fit.errors)[camera]
+    none, (cameras, markers), name = Hypothesis.of(None, (), len(window.names)), scene, window.names[camera]
+    camera_there = msgspec.structs.replace(cameras[name], T_world_cam=Pose.from_matrix(T[camera]))
+    placed = CameraArray(cameras.as_dict() | {name: camera_there}, cameras.error_scale)
+
+    def explain(at: int, known: int, mean: tuple[int, int]) -> _Explained | None:
+        keyframes = [moments.keyframe(at, known, mean, (array, markers)) for array in (cameras, placed)]
+        seen = [window_of([k], cameras, markers)[0] for k in keyframes if k is not None]
+        if keyframes[0] is None or not len(seen[0].camera):
+            return None
+        shown = max(seen, key=lambda w: np.count_nonzero(w.camera == camera))
+        moved = fit(replace(shown, T=T), none)
+        return _Explained(keyframes[0], moved, fit(replace(shown, T=window.T), none).cost - moved.cost)
+
+    k, old, new = _change(explain, len(moments.snapshots))
+    if old is None or new is None or old.gain > -limit or new.gain < old.gain + 2 * limit:
+        return False
+    expected = new.keyframe.states
+    robots = expected.retract(new.moved.bodies)
+    X = window.T[camera] @ np.linalg.inv(T[camera])  # the motion of the others, if the camera stayed
+    jumped = replace(robots, R=X[:3, :3] @ robots.R, p=robots.p @ X[:3, :3].T + X[:3, 3])
+    sigma = np.repeat(moments.prediction_sigma(k, new.keyframe.robots), 3, axis=1)
+    stay, jump = (np.sum((s.minus(expected)[:, :6] / sigma) ** 2) for s in (robots, jumped))
+    return bool(stay < chdtri(sigma.size, FALSE_ALARM) and jump - stay > limit)
+
+
+def _change(
+    explain: Callable[[int, int, tuple[int, int]], _Explained | None], n: int
+) -> tuple[int, _Explained | None, _Explained | None]:
+    """The moment, of n, after which the new pose explains more, by bisection, and then by the robots' motion before:
+    the filter follows images that changed. With the frame sets there and next."""
+    before, after = N_MEAN, n - N_MEAN - 1
+    start = explain(before, before, (0, 2 * N_MEAN)) if before < after else None
+    if start is None or start.gain > 0:  # it was so from the start
+        return 0, None, None
+    while after - before > 1:
+        middle = (before + after) // 2
+        found = explain(middle, middle, (middle - N_MEAN, middle + N_MEAN))
+        before, after = (before, middle) if found is not None and found.gain > 0 else (middle, after)
+    first, last = max(N_MEAN + 1, before - N_MEAN), min(before + N_MEAN, n - 1)
+    steps = [(k, *(explain(at, k, (k - N_MEAN, k)) for at in (k, k + 1))) for k in range(first, last)]
+    known = [(k, old, new) for k, old, new in steps if old is not None and new is not None]
+    return max(known, key=lambda step: step[2].gain - step[1].gain, default=(0, None, None))
 
 
 def _measure(

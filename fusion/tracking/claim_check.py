@@ -3,7 +3,9 @@
 
 The squared residuals of a robot's detections in a frame set, in claimed standard deviations, have an expected sum:
 their number less what the estimate absorbs (redundancy, Baarda 1968). Sums over some seconds are compared. A camera is
-named if all residuals fit once it is left out, and not once any other is; a robot if the others of its cameras fit.
+named if all residuals fit once it is left out, and not once any other is; of three cameras none, since two that moved
+together look like the third. A robot is named if it contradicts with and without each camera, and others of its cameras
+fit.
 
 The errors of the rig are the same in all frame sets, so they do not average: their part of the expectation has the
 degrees of freedom of one pose (Satterthwaite 1946).
@@ -28,6 +30,7 @@ from fusion.model.observations import (
 from fusion.model.states import States
 from fusion.protocol.arena_health import describe_contradiction
 from fusion.protocol.pose_messages import Contradiction
+from fusion.rig_graph.hypotheses import MIN_FOR_PAIRS
 from fusion.tracking.estimator import Estimator, Prediction
 
 SAMPLE_EVERY, SAMPLE = 8, 4  # frame sets, and robots of one: a few milliseconds for any number of robots
@@ -163,19 +166,18 @@ class ClaimCheck:
         bad = self._all.contradicts() & known
         if not bad.any():
             return ()
-        fine = known & ~bad
-        involved = self._left_out[bad].sum(axis=0) > 0
+        involved, cleared = (self._left_out[rows].sum(axis=0) > 0 for rows in (bad, known & ~bad))
         still = self._without.contradicts() | (self._without.redundancy <= MIN_REDUNDANCY)
-        explains = involved & ~still[bad].any(axis=0) & ~(self._left_out[fine].sum(axis=0) > 0)
-        if explains.sum() == 1:
+        explains = involved & ~still[bad].any(axis=0) & ~cleared
+        if explains.sum() == 1 and involved.sum() > MIN_FOR_PAIRS:
             errors_m2 = self._left_out_m2[bad][:, explains].sum() / self._left_out[bad][:, explains].sum()
             return (self._describe("camera", bad, explains, errors_m2),)
-        if not explains.any() and (fine.any() or bad.sum() == 1):
+        are_own = (self._without.contradicts() | (self._left_out == 0))[bad].all()
+        if are_own and (cleared[involved].all() or known.sum() == 1):
             rows = np.eye(len(bad), dtype=bool)[bad]
             return tuple(self._describe("robot", row, involved, self._mean_m2(row)) for row in rows)
-        return (
-            self._describe("undecided", bad, explains if explains.any() else involved, self._mean_m2(bad)),
-        )
+        several = explains if explains.sum() > 1 else involved
+        return (self._describe("undecided", bad, several, self._mean_m2(bad)),)
 
     def _mean_m2(self, robots: Mask) -> float:
         """The mean squared error of the detections of these robots, square metres."""

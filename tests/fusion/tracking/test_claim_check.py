@@ -51,9 +51,9 @@ def contradictions(
     return tracker.claims.contradictions()
 
 
-def with_turned(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
+def with_turned(cameras: dict[str, Camera], name: str, degrees: float = DEGREES) -> dict[str, Camera]:
     T = cameras[name].matrix().copy()
-    T[:3, :3] = T[:3, :3] @ rotation_from_vector(np.radians([0.0, DEGREES, 0.0]))
+    T[:3, :3] = T[:3, :3] @ rotation_from_vector(np.radians([0.0, degrees, 0.0]))
     return cameras | {name: msgspec.structs.replace(cameras[name], T_world_cam=Pose.from_matrix(T))}
 
 
@@ -79,6 +79,12 @@ def test_of_four_cameras_the_turned_one_is_among_those_that_contradict_each_othe
     assert found.kind in ("camera", "undecided")
     assert "cam1" in found.names
     assert {"cam0", "cam2"}.isdisjoint(found.names)
+
+
+def test_of_three_cameras_none_is_named():
+    """Two that turned together would look like the third."""
+    (found,) = contradictions(frames(3), with_turned(ring(3), "cam1", 3 * DEGREES))
+    assert (found.kind, found.names) == ("undecided", ("cam0", "cam1", "cam2"))
 
 
 def test_a_displaced_marker_is_its_robot_s(of_four: list[CalibratedFrame]):
