@@ -12,6 +12,7 @@ See docs/design/time_offsets.md.
 import logging
 import math
 from dataclasses import dataclass, replace
+from statistics import median_high, median_low
 from typing import Literal
 
 from camera_node.foundation.logs import about
@@ -156,6 +157,17 @@ class CameraClocks:
         clock.correction_s, clock.since_ns = clock.at(t_ns) + departure.offset_s, t_ns
         clock.rate, clock.sigma_s = clock.rate + departure.rate, departure.sigma_s
         clock.rate_sigma = departure.rate_sigma
+
+    def hold_common_rate(self, t_ns: int) -> None:
+        """Let no rate be common to most clocks from a time on: robots show differences only, and each departure may
+        leave a part of its rate with the others, which would move all robots along their paths for ever."""
+        rates = [clock.rate for clock in self._clocks.values()]
+        common = min(
+            max(0.0, median_low(rates)), median_high(rates)
+        )  # of the medians the one nearest to none
+        for clock in self._clocks.values() if common else ():
+            clock.correction_s, clock.since_ns = clock.at(t_ns), t_ns
+            clock.rate -= common
 
 
 def uncertain(frame_set: FrameSet, speed_m_s: float) -> set[str]:

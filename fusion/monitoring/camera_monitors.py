@@ -65,6 +65,7 @@ class CameraMonitors:
         corrections = self.rig.check(frame_set, now, recalibrates, is_doubtful)
         for departure in self.rig.take_departures():
             self.clocks.correct(departure)
+        self.clocks.hold_common_rate(frame_set.t_ns)
         for correction in corrections:
             if correction.camera is not None:
                 self._cameras.place(correction.name, correction.camera)

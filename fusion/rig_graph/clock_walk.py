@@ -7,17 +7,22 @@ estimate, by a margin over every other one: a generalized likelihood ratio, as i
 docs/design/time_offsets.md has the equations.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri
 
 from calib.rig.camera_errors import ERRORS
-from camera_node.foundation.arrays import Array
+from camera_node.foundation.arrays import Array, Index
 from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, RIVAL
 
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock
 RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crystals have 1e-4, bad drivers more
+CHANGED_SIGMA = (
+    0.1,
+    1e-2,
+)  # of an offset, s, and a rate that changed: cameras have stated rates that are 1 % wrong
 RATE_WALK = 1e-4  # change of a rate in a second: a daemon that slews a clock changes it by 5e-4 at once
 MEMORY_S = 10.0  # of errors of poses and lenses: what they do to offsets varies with the places of robots
 
@@ -47,7 +52,8 @@ class ClockWalk:
     Attributes:
         x, P: (9 C,) the errors of the cameras, 8 of each, and then the rates of their clocks; and their covariance.
         offsets, rates: (C,) rows of these.
-        departed: cameras whose clocks jumped or drifted, oldest first: they are not held to be right any more.
+        departed: cameras whose clocks jumped or drifted, oldest first: they are not held to be right until they are
+            known again, as well as a good clock. Else the last one would be the reference for ever, whatever it did.
     """
 
     def __init__(self, n_cameras: int) -> None:
@@ -55,43 +61,76 @@ class ClockWalk:
         self.rates = ERRORS * n_cameras + np.arange(n_cameras)
         self.offsets = ERRORS * np.arange(n_cameras) + CAUSES["clock"].start
         self.x = np.zeros((ERRORS + 1) * n_cameras)
+        self._corrected: set[int] = set()  # the cameras that have departed so far
         self._most = np.concatenate([np.tile(FREE_SIGMA, n_cameras), np.full(n_cameras, RATE_SIGMA)])
         self.P = np.diag(self._most**2)
         self.P[self.offsets, self.offsets] = OFFSET_SIGMA_S**2
 
     def forget_poses(self) -> None:
         """The poses of the cameras are others."""
-        others = np.setdiff1d(np.arange(ERRORS * self._n), self.offsets)
-        self.x[others], self.P[others], self.P[:, others] = 0.0, 0.0, 0.0
-        self.P[others, others] = self._most[others] ** 2
+        self.P = self._without_poses(range(self._n))
+        self.x[self._poses(range(self._n))] = 0.0
+
+    def _poses(self, cameras: Sequence[int]) -> Index:
+        """Rows of what is known of cameras beside their clocks."""
+        rows = (ERRORS * np.array(cameras)[:, None] + np.arange(ERRORS)).ravel()
+        return np.setdiff1d(rows, self.offsets)
+
+    def _without_poses(self, cameras: Sequence[int]) -> Array:
+        """The covariance if the poses and lenses of cameras are others."""
+        P, rows = self.P.copy(), self._poses(cameras)
+        P[rows], P[:, rows] = 0.0, 0.0
+        P[rows, rows] = self._most[rows] ** 2
+        return P
+
+    def _with_other_clock(self, camera: int) -> Array:
+        """The covariance if the clock of a camera jumped, or has another rate."""
+        P, clock = self.P.copy(), [self.offsets[camera], self.rates[camera]]
+        P[clock, clock] += np.square(CHANGED_SIGMA)
+        return P
 
     def jump(self, camera: int, sigma_s: float, rate_sigma: float) -> None:
         """The stamps of a camera were corrected by a jump with this standard deviation, or may have jumped so far.
         Their rate was corrected until then by as much as `rate_sigma`."""
         self.P[self.offsets[camera], self.offsets[camera]] += sigma_s**2
         self.P[self.rates[camera], self.rates[camera]] += rate_sigma**2
-        self._most[self.rates[camera]] = max(RATE_SIGMA, rate_sigma)
+        self._most[self.rates[camera]] = CHANGED_SIGMA[1]
         self._depart(camera)
 
     def _depart(self, camera: int) -> None:
         """At least one clock is held to be right: the windows show differences."""
+        self._corrected.add(camera)
         others = [k for k in self.departed if k != camera]
         self.departed = [*others, camera][max(0, len(others) + 2 - self._n) :]
 
     def update(self, t_ns: int, H: Array, y: Array) -> bool:
         """Add keyframes: least squares H e = y, (8 C, 8 C) and (8 C,), about the cameras' errors at their mean time.
 
-        Keyframes that contradict the estimate beyond chance show that a camera moved, even if less than what
-        `judge` finds: its pose must not look like a clock. They are not used, and poses are forgotten; returns False.
+        Keyframes that contradict the estimate beyond chance show that a clock changed, if that of one camera explains
+        them and the pose of none does as well. Else a camera moved, even if less than what `judge` finds: its pose must
+        not look like a clock. Then they are not used, and poses are forgotten; returns False.
         """
         self._predict(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
         self._t_ns, seen = t_ns, slice(0, len(y))
-        P = np.linalg.solve(np.eye(len(self.P)) + self.P[:, seen] @ np.pad(H, ((0, 0), (0, self._n))), self.P)
-        off = y - H @ self.x[seen]
-        explained = np.linalg.solve(H + np.diag(np.tile(FREE_SIGMA**-2, self._n)), off) - P[seen, seen] @ off
-        if off @ explained > chdtri(len(y), FALSE_ALARM):
-            self.forget_poses()
-            return False
+        off, limit = y - H @ self.x[seen], chdtri(len(y), FALSE_ALARM)
+        free = np.linalg.solve(H + np.diag(np.tile(FREE_SIGMA**-2, self._n)), off)
+
+        def explain(P: Array) -> tuple[float, Array]:
+            """The cost of the keyframes by an estimate, and its covariance with them."""
+            with_them = np.linalg.solve(np.eye(len(P)) + P[:, seen] @ np.pad(H, ((0, 0), (0, self._n))), P)
+            return float(off @ (free - with_them[seen, seen] @ off)), np.asarray(with_them, float)
+
+        cost, P = explain(self.P)
+        if cost > limit:
+            cameras = range(self._n) if self._n > 2 else ()
+            changed = [(*explain(self._with_other_clock(k)), k) for k in cameras]
+            moved = min((explain(self._without_poses([k]))[0] for k in cameras), default=0.0)
+            cost, P, camera = min(changed, key=lambda c: c[0], default=(np.inf, P, 0))
+            if cost > limit or cost + chdtri(2, RIVAL) > moved:
+                self.forget_poses()
+                return False
+            self._depart(camera)
+            self._most[self.rates[camera]] = CHANGED_SIGMA[1]
         self.P = (P + P.T) / 2
         self.x = self.x + self.P[:, seen] @ off
         return True
@@ -133,7 +172,16 @@ class ClockWalk:
             self.P[clock, clock] += explain(self.departed)[1][-1] ** 2
         _, alone, sigma = explain(self.departed)
         self.x[of_clocks[self.departed]] -= alone
-        return tuple(
+        departures = [
             Departure(k, self._t_ns, *a.tolist(), *b.tolist())
             for k, a, b in zip(self.departed, alone, sigma, strict=True)
-        )
+        ]
+        known = [
+            Departure(k, self._t_ns, 0.0, 0.0, *explain([k])[2][0].tolist())
+            for k in self._corrected.difference(self.departed)
+        ]
+        if self._n > 2:  # of two, the one that departed before departs again
+            self.departed = [
+                d.camera for d in departures if d.sigma_s > OFFSET_SIGMA_S or d.rate_sigma > RATE_SIGMA / 2
+            ]
+        return (*departures, *known)

@@ -114,6 +114,28 @@ def test_a_drift_that_ends_is_not_corrected_any_more():
     assert outcome.worst_m(set_s + 1.0) < 0.005
 
 
+def test_a_clock_that_drifts_quickly_is_corrected_within_two_seconds():
+    """Keyframes that contradicted what was known of the clocks were not used: 5000 ppm were followed after 5 s, by when
+    poses were wrong by 15 mm."""
+    load = replace(LOAD, robots=6, speed_m_s=0.5)
+    outcome = fuse(load, 7.0, {"cam1": drift(FAULT_S, 5000.0)})
+    require_harmless(outcome, {"cam1": drift})
+    assert outcome.worst_m(FAULT_S + 2.0) < 0.003
+
+
+def test_a_rate_that_most_clocks_have_in_common_is_none():
+    """Robots show differences only; all would move along their paths."""
+    clocks = CameraClocks(("cam0", "cam1", "cam2", "cam3"))
+    for k, rate in enumerate((3e-4, 3e-4, 2e-4, 5e-3)):
+        clocks.correct(Departure(k, START_NS, 0.0, rate, 1e-4, 1e-5))
+    clocks.hold_common_rate(START_NS)
+    frames = {f.camera: f for f in LOAD.frames(1 / LOAD.hz)}
+    later = {"t_ns": START_NS + 10**9, "received_ns": START_NS + 10**9}
+    admitted = [clocks.admit(replace(frame, **later)) for frame in frames.values()]
+    offsets_s = sorted((f.t_ns - START_NS) * 1e-9 - 1.0 for f in admitted if f is not None)
+    assert offsets_s == pytest.approx([-1e-4, 0.0, 0.0, 4.7e-3], abs=1e-8)
+
+
 def test_a_drift_that_is_not_measured_any_more_becomes_uncertain():
     """The correction grows by the rate, and its standard deviation by that of the rate."""
     clocks, rest_s = CameraClocks(("cam0", "cam1", "cam2")), 600

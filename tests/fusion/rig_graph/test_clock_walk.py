@@ -49,6 +49,25 @@ def test_good_clocks_are_left_alone(n_cameras: int):
     assert not any(first_departure([0.0] * n_cameras, seed) for seed in range(20))
 
 
+def test_the_last_clock_that_did_not_jump_is_no_reference_for_ever():
+    """All others jumped once, and it drifts later: they were corrected to follow it, and all robots with them."""
+    rng, n, walk, corrected = np.random.default_rng(2), 4, ClockWalk(4), np.zeros(4)
+    corrections = [Departure(k, START_NS, 0.0, 0.0, 0.0, 0.0) for k in range(n)]
+    for step in range(160):
+        t_ns = START_NS + step * 500_000_000
+        if step in (10, 20, 30):
+            walk.jump(step // 10, 1e-3, 0.0)
+        offsets = np.array([5e-4 * max(0.0, 0.5 * step - 40.0), 0.0, 0.0, 0.0])
+        corrected = offsets - [c.at(t_ns) for c in corrections]
+        walk.update(t_ns, *about_offsets(corrected + SIGMA_S * rng.normal(size=n)))
+        for found in walk.take_departures():
+            old = corrections[found.camera]
+            corrections[found.camera] = Departure(
+                found.camera, t_ns, old.at(t_ns) + found.offset_s, old.rate + found.rate, 0.0, 0.0
+            )
+    assert np.abs(corrected).max() < 1e-3  # without a correction 20 ms
+
+
 def test_two_clocks_do_not_show_which_one_departs():
     assert first_departure([2e-4, 0.0], 1) is None
 
