@@ -31,9 +31,8 @@ struct Measurements {
     DiscMeasurement operator[](size_t k) const {
         DiscMeasurement m{
             {uv(k, 0), uv(k, 1), axes(k, 0), axes(k, 1), angle(k)}, {offset(k, 0), offset(k, 1)}, {}};
-        constexpr size_t n = DiscMeasurement::kCount;
-        for (size_t i = 0; i < n; ++i)
-            for (size_t j = 0; j < n; ++j) m.covariance[i][j] = covariance(k, i, j);
+        for (size_t i = 0; i < m.covariance.size(); ++i)
+            for (size_t j = 0; j < m.covariance.size(); ++j) m.covariance[i][j] = covariance(k, i, j);
         return m;
     }
 };
@@ -61,16 +60,15 @@ static std::pair<nb::object, double*> make(std::initializer_list<size_t> shape) 
 /// One row a roundel: u, v, major, minor, angle, the covariance of u, v as uu, uv, vv, and chi-square.
 static nb::object constrain(const roundel::Lens& lens, double lens_sigma, const Pairs& uv, const Pairs& axes,
                             const Values& angle, const Pairs& offset, const Covariances& covariance) {
-    constexpr size_t kColumns = 9;
     const size_t n = uv.shape(0);
     if (axes.shape(0) != n || angle.shape(0) != n || offset.shape(0) != n || covariance.shape(0) != n)
         throw nb::value_error("all columns must have one row for each roundel");
-    auto [table, rows] = make({n, kColumns});
+    auto [table, rows] = make({n, 9});
     const Measurements measured{uv, axes, angle, offset, covariance};
     for (size_t k = 0; k < n; ++k) {
         const auto [e, cov, chi2] = roundel::constrain_to_lens(measured[k], lens, lens_sigma);
         const std::array row{e.x, e.y, e.major, e.minor, e.angle, cov.xx, cov.xy, cov.yy, chi2};
-        std::copy(row.begin(), row.end(), rows + k * kColumns);
+        rows = std::copy(row.begin(), row.end(), rows);
     }
     return table;
 }
@@ -79,20 +77,19 @@ static nb::object constrain(const roundel::Lens& lens, double lens_sigma, const 
 /// across the normal.
 static nb::object disc_pictures(const Triples& position, const Triples& normal) {
     using roundel::DiscView;
-    constexpr size_t kNumbers = DiscView::kNumbers, kUnknowns = DiscView::kUnknowns;
     const size_t n = position.shape(0);
     if (normal.shape(0) != n) throw nb::value_error("positions and normals of different numbers of discs");
-    auto [pictures, picture] = make({n, kNumbers});
-    auto [derivatives, J] = make({n, kNumbers, kUnknowns});
+    auto [pictures, picture] = make({n, DiscView::kNumbers});
+    auto [derivatives, J] = make({n, DiscView::kNumbers, DiscView::kUnknowns});
     auto [tangents, across] = make({n, 3, 2});
     for (size_t k = 0; k < n; ++k) {
         const DiscView disc({position(k, 0), position(k, 1), position(k, 2)},
                             {normal(k, 0), normal(k, 1), normal(k, 2)});
         const auto [seen, by] = disc.predict();
         const auto [first, second] = disc.tangents();
-        for (size_t i = 0; i < kNumbers; ++i) {
+        for (size_t i = 0; i < DiscView::kNumbers; ++i) {
             *picture++ = seen[i];
-            for (size_t j = 0; j < kUnknowns; ++j) *J++ = by[j][i];
+            for (size_t j = 0; j < DiscView::kUnknowns; ++j) *J++ = by[j][i];
         }
         for (const double value : {first.x, second.x, first.y, second.y, first.z, second.z})
             *across++ = value;

@@ -14,8 +14,6 @@ namespace roundel {
 namespace {
 
 // Limits within which a shape is ring-like.
-constexpr Print kThinnest{0.8};
-constexpr Print kThickest{0.2};
 constexpr double kMinDiameter = 6;
 constexpr double kMaxDiameter = 10000;
 constexpr double kSameCentre = 0.3;  // minor axes, for two ellipses of one ring
@@ -24,7 +22,7 @@ constexpr size_t kMaxCandidates = 4096;
 
 RoundelLimits ring_limits(double noise) {
     RoundelLimits limits;
-    limits.prints = {kThickest, {0.4}, {0.6}, kThinnest};
+    limits.prints = {{0.2}, {0.4}, {0.6}, {0.8}};
     limits.ratio_tolerance = 0.1;
     limits.min_diameter = kMinDiameter;
     limits.max_diameter = kMaxDiameter;

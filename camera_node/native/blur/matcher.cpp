@@ -20,7 +20,6 @@ constexpr double kMinDistance = 0.3;     // minor axes between two matches
 
 // New roundels.
 constexpr double kLengths[] = {0.25, 0.4, 0.55, 0.75, 1};  // of the motion, diameters
-constexpr double kLongest = 1;
 constexpr double kNeighbour = 1.65;       // factor between two neighbours of these lengths at most
 constexpr double kMaxFirstMisfit = 0.4;   // RMS over the contrast in the direction of the streak,
 constexpr double kMaxStartMisfit = 0.25;  // in the best direction, before the descent,
@@ -209,7 +208,7 @@ std::optional<MovingMatch> MotionBlurMatcher::match_streak(const ImageView& imag
     for (const double turn : kTurns) {
         const DiscPlace place{double(s.x), double(s.y), angle + turn, width, width};
         sample(image, place, levels);
-        compare(levels, place, {2, 0, kLongest}, best);
+        compare(levels, place, {2, 0, INFINITY}, best);
         if (!best.found) return std::nullopt;
     }
     if (best.misfit > kMaxStartMisfit || !descend(image, best)) return std::nullopt;

@@ -13,8 +13,7 @@ namespace {
 constexpr double kExtent = 1.15;  // of the grid of a known roundel, outer radii
 constexpr int kDirections = 6;
 constexpr double kLengths[] = {0.35, 0.7};  // of the motion, diameters
-constexpr int kKnownTimeSteps = 12;         // of the exposure
-constexpr int kNewTimeSteps = 16;           // of the exposure
+constexpr int kTimeSteps = 16;              // of the exposure
 constexpr double kGroundVariance = 30;      // of a new roundel's ground, over that of other residuals
 
 /// The numbers of time steps in which a point sees each level.
@@ -23,10 +22,10 @@ struct LevelCounts {
 };
 
 /// `point` and `motion` are in outer radii of a disc with its centre, at mid-exposure, at the origin.
-LevelCounts count_levels(DiscPoint point, DiscPoint motion, double ratio, int time_steps) {
+LevelCounts count_levels(DiscPoint point, DiscPoint motion, double ratio) {
     LevelCounts counts;
-    for (int n = 0; n < time_steps; ++n) {
-        const double t = (n + 0.5) / time_steps - 0.5;
+    for (int n = 0; n < kTimeSteps; ++n) {
+        const double t = (n + 0.5) / kTimeSteps - 0.5;
         const double x = point.x - t * motion.x, y = point.y - t * motion.y, rr = x * x + y * y;
         ++(rr > kCardRatio * kCardRatio   ? counts.ground
            : rr < 1 && rr > ratio * ratio ? counts.ink
@@ -78,9 +77,9 @@ KnownTemplates::KnownTemplates(const InitialGuess& known) {
             const DiscPoint motion{(c * x + s * y) / a, (c * y - s * x) / b};
             KnownTemplate t{x, y, {}, {}, 1e-6f};
             for (size_t n = 0; n < grid.size(); ++n) {
-                const auto counts = count_levels(grid[n], motion, known.ratio, kKnownTimeSteps);
-                t.level[n] = float(known.bright + (known.dark - known.bright) * counts.ink / kKnownTimeSteps);
-                t.ground[n] = float(double(counts.ground) / kKnownTimeSteps);
+                const auto counts = count_levels(grid[n], motion, known.ratio);
+                t.level[n] = float(known.bright + (known.dark - known.bright) * counts.ink / kTimeSteps);
+                t.ground[n] = float(double(counts.ground) / kTimeSteps);
                 t.ground_ground += t.ground[n] * t.ground[n];
             }
             templates_.push_back(t);
@@ -94,9 +93,9 @@ NewTemplate::NewTemplate(double print_ratio, double motion_length)
     for (size_t k = 0; k < kPoints; ++k) {
         const DiscPoint point{spread(int(k) % kAlong, kAlong, kReachAlong),
                               spread(int(k) / kAlong, kAcross, kReachAcross)};
-        const auto counts = count_levels(point, {2 * length, 0}, ratio, kNewTimeSteps);
-        const Vector<3> shares{double(counts.paper) / kNewTimeSteps, double(counts.ink) / kNewTimeSteps,
-                               double(counts.ground) / kNewTimeSteps};
+        const auto counts = count_levels(point, {2 * length, 0}, ratio);
+        const Vector<3> shares{double(counts.paper) / kTimeSteps, double(counts.ink) / kTimeSteps,
+                               double(counts.ground) / kTimeSteps};
         const double w = 1 / (1 + kGroundVariance * shares[2] * shares[2]);
         for (size_t i = 0; i < 3; ++i) {
             share[i].at[k] = float(shares[i]);

@@ -14,6 +14,7 @@ namespace roundel {
 namespace {
 
 constexpr int kNowhere = INT32_MIN / 2;
+constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
 
 ROUNDEL_INLINE Bits floor_of(const Lanes& x) {
     const Bits near = __builtin_convertvector(x, Bits);
@@ -163,7 +164,6 @@ ROUNDEL_INLINE void append(const ImageView& image, int y, int begin, int end, Ed
     begin = std::max(begin, 0);
     end = std::min({end, image.width, begin + EdgePixels::kMax - to.end()});
     const uint8_t* row = image.row(y);
-    constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
     for (int u = begin; u < end; u += kLanes) {
         const int at = to.end() + u - begin;
         store(to.x + at, float(u - to.origin_x) + kSteps);
@@ -208,7 +208,6 @@ ROUNDEL_INLINE void append_strip(const ImageView& image, const CircleImage& edge
                                  int step, EdgePixels& to) {
     const RowEllipse around(edge, distance), hole(edge, -distance);
     const RowEllipses outside = RowEllipses::all_of(around), inside = RowEllipses::all_of(hole);
-    constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
     const int bottom = int(std::floor(around.bottom));
     for (int y = first; y <= bottom; y += kLanes * step) {
         const Lanes rows = float(y) + float(step) * kSteps;
@@ -313,7 +312,6 @@ ROUNDEL_CLONES void add_up(const Rows& image, const PlateauEdges& edges, int ste
     const RowEllipses outer = RowEllipses::all_of(edges.ring),
                       middle = RowEllipses::all_of(edges.around_hole),
                       inner = RowEllipses::all_of(edges.hole);
-    constexpr Lanes kSteps{0, 1, 2, 3, 4, 5, 6, 7};
     const int top = int(std::ceil(edges.ring.top)), bottom = int(std::floor(edges.ring.bottom));
     for (int y = top; y <= bottom; y += kLanes * step) {
         const Lanes rows = float(y) + float(step) * kSteps;

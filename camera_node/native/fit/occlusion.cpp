@@ -16,7 +16,6 @@ namespace {
 
 constexpr double kBand = 2;       // half width of the band around an edge, pixels
 constexpr int kPixels = 1500;     // approximate number of pixels used
-constexpr double kChance = 4;     // standard deviations
 constexpr double kReach = 2;      // blur of an occluding object's edge, pixels
 constexpr int kAround = 2;        // sectors on either side that a mean includes
 constexpr size_t kCluster = 4;    // sectors whose residuals may be correlated: an eighth of the turn
@@ -133,7 +132,7 @@ void SectorSums::append_mean_squares(std::vector<double>& to) const {
 Sectors SectorSums::exceeding(double noise, double slack) const {
     Sectors off = 0;
     for (size_t s = 0; s < kSectors; ++s) {
-        const double chance = kChance * std::sqrt(2 * squared_[s]);
+        const double chance = kUnlikely * std::sqrt(2 * squared_[s]);
         const double limit = noise * noise * (weight_[s] + chance) + slack * slack * weight_[s];
         off |= Sectors(rr_[s] > limit) << s;
     }

@@ -15,6 +15,12 @@ namespace roundel {
 using Sectors = uint32_t;
 constexpr int kSectors = 32;
 
+/// Standard deviations of what noise does not do: by chance once in 16,000. Squared vectors of two components
+/// in the plane are as unlikely beyond -2 log of that.
+constexpr double kUnlikely = 4, kUnlikelySquare = 19.3;
+/// Standard deviations of a difference that is no chance where it decides between two sources: once in 370.
+constexpr double kContradiction = 3;
+
 inline int count_sectors(Sectors sectors) { return std::popcount(sectors); }
 /// One of the runs of adjacent sectors in a set that is not empty; the last sector and the first are
 /// adjacent.

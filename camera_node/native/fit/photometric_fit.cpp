@@ -20,11 +20,9 @@ namespace {
 constexpr double kNarrow = 1.25;
 constexpr double kNarrowBlurs = 1.5;
 constexpr double kWide = 2.5;
-constexpr double kWideBlurs = 2.5;
 
 constexpr int kCoarsePixels = 200;
 constexpr int kMaxSteps = 12;
-constexpr double kConverged = 1;            // remaining distance in standard deviations
 constexpr double kVisible = 2.5;            // times the noise: the slope of an edge is 0.4 contrast / blur
 constexpr int kResumedPixels = 128;         // of the first iterations from the last frame's model,
 constexpr int kMinSampling = 3;             // used if there are so many times as many pixels
@@ -33,7 +31,6 @@ constexpr int kEdgeUnknowns = kCount - 3;   // all but the grey levels
 
 constexpr double kScale = 1.06;      // standard deviation of Gaussian noise over that of weighted residuals
 constexpr double kNoiseFloor = 1;    // grey levels
-constexpr double kGroundChance = 4;  // standard deviations of the ground's residuals, by noise
 constexpr double kEvenGround = 4;    // spread that halves the weight of pixels at the card's edge
 constexpr double kReweighed = 0.1;   // of a step that changes the weights of residuals: what is left of it
 constexpr double kRatioPrior = 0.3;  // standard deviation
@@ -47,9 +44,6 @@ constexpr double kStrictScale = 0.5;
 constexpr double kSlackScale = 1.3;  // the tolerance of a median of few residuals
 
 constexpr double kSeparateBlurs = 4;  // of wide bands that contain a single edge, and of plateaus
-
-/// Chi-square with two degrees of freedom from which residuals show a field: by chance once in 22,000.
-constexpr double kUnlikelyField = 20;
 
 // 2. Fields of light and of bent paper
 constexpr int kFieldSteps = 8;
@@ -74,7 +68,6 @@ constexpr double kMinPlateauMajor = 48;  // pixels: smaller ones gain less than 
 constexpr double kPlateauVariance = 2;   // factor from that of the residuals at the edges
 
 // 4. The print
-constexpr double kMaxChance = 3;  // standard deviations: of the print, and of the levels far from the edges
 constexpr double kOtherPrint = 0.1;  // difference of ratios of another print, however uncertain the ratio is
 
 /// The fields that a fit contains or tests its residuals for.
@@ -240,7 +233,7 @@ bool PhotometricFitter::finish() {
 
 EdgeBand PhotometricFitter::whole_band() const {
     const bool card = std::abs(p_[kGround] - p_[kBright]) > kMinCardStep * contrast();
-    return {std::max(kNarrow, kNarrowBlurs * p_[kBlur]), std::max(kWide, kWideBlurs * p_[kBlur]), card,
+    return {std::max(kNarrow, kNarrowBlurs * p_[kBlur]), kWide * std::max(1.0, p_[kBlur]), card,
             std::max(kWide, kSeparateBlurs * p_[kBlur])};
 }
 
@@ -295,7 +288,7 @@ bool PhotometricFitter::solve(double scale) {
 }
 
 bool PhotometricFitter::is_converged(double left) const {
-    return left < kConverged * noise_ / std::sqrt(edge_information());
+    return left < noise_ / std::sqrt(edge_information());
 }
 
 bool PhotometricFitter::is_near(double left) const {
@@ -341,7 +334,7 @@ void PhotometricFitter::update_noise() {
     slope_ = std::clamp(sums_.mpsi / sums_.m, 0.5, 1.0);
     scale_ = std::max(kNoiseFloor, kScale * std::sqrt(sums_.mrr / (sums_.m * freedom)));
     noise_ = std::max(kNoiseFloor, std::sqrt(sums_.mwrr / (sums_.m * freedom)) / slope_);
-    const double chance = kGroundChance * std::sqrt(2 * sums_.ground_ground);
+    const double chance = kUnlikely * std::sqrt(2 * sums_.ground_ground);
     const double beyond = sums_.ground_rr / square(noise_) - sums_.ground - chance;
     ground_ = kPatch * std::max(0.0, beyond) / std::max(sums_.ground_ground, 1e-9);
 }
@@ -367,7 +360,7 @@ bool PhotometricFitter::shows_bend() {
     fields_.scores = score_fields(equations_, pixels_, FieldFrame(p_), step, {scale_, spread_});
     for (double* score : {&fields_.scores.bend, &fields_.scores.light}) *score /= square(noise_);
     const double most = std::max(kLeastBentResidual, kBentResidual * (p_[kAxx] + p_[kAyy]));
-    return allowed_ == AllowedFields::kBend && fields_.scores.bend > kUnlikelyField &&
+    return allowed_ == AllowedFields::kBend && fields_.scores.bend > kUnlikelySquare &&
            scale_ < most * contrast();
 }
 
@@ -467,7 +460,7 @@ bool PhotometricFitter::condition_on_plateau(Parameter level, const Plateau& pla
     double variance = 1.0 / plateau.count;  // in units of the noise: of the plateau, and of the fit's level
     for (const double x : factor_->halfway(unit)) variance += square(x);
     const double off = plateau.mean - p_[level], n = plateau.count;
-    if (square(off) > square(kMaxChance * noise_) * variance) return false;
+    if (square(off) > square(kContradiction * noise_) * variance) return false;
     system_.H[level][level] += n;
     g[level] = n * off;
     return true;
@@ -528,7 +521,7 @@ bool PhotometricFitter::condition_on_print(const Print& print) {
     const double seen = print.ratio + effect_of_curvature(tone_.expected)[kRatio];
     const double off = seen - p_[kRatio];
     const double variance = with[kRatio] + square(bent[kRatio]) + square(print.sigma);
-    if (square(off) > square(kMaxChance) * variance) return false;
+    if (square(off) > square(kContradiction) * variance) return false;
     for (int i = 0; i < kPoseCount; ++i) {
         const double both = with[kX + i] + bent[kX + i] * bent[kRatio];
         tone_.deviation[i] = bent[kX + i] / noise_;
@@ -595,7 +588,7 @@ void PhotometricFitter::allow_shading(const LightGradient& light) {
     const double sx = (S.yy * ex - S.xy * ey) / det, sy = (S.xx * ey - S.xy * ex) / det;
     const double left_x = shading_.seen.x - sx, left_y = shading_.seen.y - sy;
     const bool contradicts =
-        square(left_x) + square(left_y) > kUnlikelyField * (shading_.seen.variance + square(light.sigma));
+        square(left_x) + square(left_y) > kUnlikelySquare * (shading_.seen.variance + square(light.sigma));
     const Parameters by_x = factor_->solve_tail<kCount>(yx), by_y = factor_->solve_tail<kCount>(yy);
     const double* Kx = &by_x[kX];
     const double* Ky = &by_y[kX];
@@ -666,7 +659,7 @@ RoundelFit PhotometricFitter::fit() const {
     fit.ground = spread_ && ground_ > kEvenGround ? ground_ : 0;
     fit.shading = shading_.seen;
     fit.clipped = clipped_;
-    fit.uneven = fields_.scores.light > kUnlikelyField;
+    fit.uneven = fields_.scores.light > kUnlikelySquare;
     fit.fields = fields_.in_image;
     fit.bend = bend();
     fit.support = sums_.agreeing / sums_.ring * pixels_.used / pixels_.expected;

@@ -5,6 +5,8 @@
 
 namespace roundel {
 
+constexpr int kTile = 8;  // pixels of a side of a tile, in maps of an image
+
 /// A view of an 8-bit grey image; `stride` is the distance between rows in bytes.
 struct ImageView {
     const uint8_t* data;

@@ -10,7 +10,6 @@ namespace roundel {
 
 namespace {
 
-constexpr int kTile = 8;            // pixels of a tile's side
 constexpr int kCell = 4;            // tiles of a cell's side
 constexpr uint16_t kNever = 65535;  // differs much from any sum
 constexpr double kCard = 1.4,

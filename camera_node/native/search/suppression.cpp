@@ -4,11 +4,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "numeric/image.hpp"
+
 namespace roundel {
 
 namespace {
-
-constexpr int kTile = 8;
 
 bool is_inside(const Ellipse& e, double x, double y, double scale = 1) {
     const double dx = (x - e.x) / scale, dy = (y - e.y) / scale;

@@ -49,7 +49,7 @@ double noise_level(const ImageView& image) {
 
 namespace {
 
-constexpr int kShift = 3, kTile = 1 << kShift;
+constexpr int kShift = 3;  // 2^3 = kTile
 
 /// Repeats each of n values `kTile` times.
 ROUNDEL_CLONES void repeat(const uint8_t* from, int n, uint8_t* to) {

@@ -13,17 +13,15 @@ namespace roundel {
 
 namespace {
 
-constexpr double kMisfit = 0.045;         // of the contrast: RMS residual on the ring's edges
-constexpr double kRaggedMisfit = 0.062;   // the same for smoothed edges
-constexpr double kMinRagged = 16;         // pixels: smaller ragged rings may be letters
-constexpr double kMaxGrowth = 2.5;        // factor of the misfit allowed for the largest roundels, and
-constexpr double kMaxRaggedGrowth = 1.5;  // for smoothed ones
-constexpr double kMaxOffset = 0.15;       // pixels: RMS displacement of an edge around its ellipse
-constexpr double kChance = 2;             // times the displacement that noise alone makes
-constexpr double kHardBlur = 0.35;        // pixels: sharper edges were drawn to whole pixels
-constexpr double kMinCard = 1.1;          // outer diameters: least diameter of a card whose edge shows
-constexpr double kProcessing = 0.5;       // share of a misfit that may be common to a whole edge
-constexpr double kMaxProcessing = 0.1;    // of the contrast: residuals that processing may make
+constexpr double kMisfit = 0.045;        // of the contrast: RMS residual on the ring's edges
+constexpr double kRaggedMisfit = 0.062;  // the same for smoothed edges
+constexpr double kMaxGrowth = 2.5;       // factor of the misfit allowed for the largest roundels
+constexpr double kMaxOffset = 0.15;      // pixels: RMS displacement of an edge around its ellipse
+constexpr double kChance = 2;            // times the displacement that noise alone makes
+constexpr double kHardBlur = 0.35;       // pixels: sharper edges were drawn to whole pixels
+constexpr double kMinCard = 1.1;         // outer diameters: least diameter of a card whose edge shows
+constexpr double kProcessing = 0.5;      // share of a misfit that may be common to a whole edge
+constexpr double kMaxProcessing = 0.1;   // of the contrast: residuals that processing may make
 // A ring of fewer pixels than this shows the product of its width and its contrast, whose factors hardly
 // differ from those of a thinner and darker ring: its ink must be black.
 constexpr double kThinRing = 3.6;
@@ -94,7 +92,7 @@ bool may_be_ragged(const RoundelFit& fit, const RoundelLimits& limits) {
 std::optional<RoundelFit> fit_ragged(const ImageView& image, const InitialGuess& guess,
                                      const AcceptanceContext& context) {
     const auto fit = fit_smoothed(image, guess);
-    const Tolerance tolerance{guess.outer.major < kMinRagged ? kMisfit : kRaggedMisfit, kMaxRaggedGrowth};
+    const Tolerance tolerance{guess.outer.major < kMinNew ? kMisfit : kRaggedMisfit, kMaxGrowth};
     const AcceptanceContext smoothed{context.limits, context.camera, context.noise * 6 / 16};
     return fit && passes(image, *fit, smoothed, tolerance) ? fit : std::nullopt;
 }

@@ -11,9 +11,7 @@ namespace {
 constexpr double kMaxLogExponent = 0.9;  // in use, 2.5: steeper ones enlarge what compression leaves
 constexpr double kSteepest = 3;          // measured, 20: powers of levels remain numbers
 constexpr int kSteps = 6;                // of Newton's method
-// A print that is only assumed or estimated:
-constexpr double kMaxByCurvature = 0.06;  // smaller roundels may be those of another print
-constexpr double kSecondOrder = 0.15;     // error of a measured curvature, over its square
+constexpr double kSecondOrder = 0.15;    // error of a measured curvature, over its square
 // Logarithm of an exponent: smaller ones count as linear, and are measured exactly to a hundredth.
 constexpr double kMinTone = 0.1;
 constexpr double kMinLeft = 0.15;    // of a curvature: less is the error of the print, or learned as a spread
@@ -102,17 +100,25 @@ void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
     if (ratios_) ratios_->forget_measurements();
 }
 
-/// What the difference between the measured ratio and the print's says about the tone curve. A curve that
-/// brightens the levels between ink and paper by `curvature` s (1 - s) moves both edges into the ring.
-std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFit& fit) const {
+/// What the difference between the measured ratio and the print's says about the tone curve, beyond what the
+/// fit contains of it. A curve that brightens the levels between ink and paper by `curvature` s (1 - s) moves
+/// both edges into the ring. None if the roundel shows no curvature that a camera's curve may have.
+std::optional<CameraModel::CurvatureSeen> CameraModel::curvature_of(const RoundelFit& fit) const {
     if (!is_measured(fit)) return std::nullopt;
     const Print& print = nearest_print(prints_, fit.ratio);
     const double by_curvature = ratio_by_curvature(fit, print.ratio);
-    const double left = (fit.ratio - print.ratio) / by_curvature, curvature = left + fit.curvature;
+    const double left = (fit.ratio - print.ratio) / by_curvature;
     const double sigma = std::hypot(fit.ratio_sigma, print.sigma) / by_curvature;
-    if (std::abs(curvature) + sigma > kMaxCurvature) return std::nullopt;
+    if (std::abs(left + fit.curvature) + sigma > kMaxCurvature) return std::nullopt;
+    return CurvatureSeen{print, by_curvature, left, sigma};
+}
+
+std::optional<CameraModel::ToneMeasurement> CameraModel::measure(const RoundelFit& fit) const {
+    const auto seen = curvature_of(fit);
+    if (!seen) return std::nullopt;
+    const auto& [print, by_curvature, left, sigma] = *seen;
+    const double curvature = left + fit.curvature;
     const bool is_other = left < kMinCurvature && !is_new_;
-    if (print.assumed && by_curvature > kMaxByCurvature) return std::nullopt;
     if (!print.is_exact() && is_other) return std::nullopt;
     const auto exponent = [&](double k) { return log_exponent_of(fit.dark, fit.bright, 0.5 + k / 4); };
     const double here = exponent(curvature);
@@ -214,14 +220,10 @@ void CameraModel::learn_curvature(const std::vector<const RoundelFit*>& fits) {
     std::vector<double> excess;
     double least = square(kMaxCurvature);  // variance of the exponent's own error, as a curvature
     for (const RoundelFit* fit : fits) {
-        if (!is_measured(*fit)) continue;
-        const Print& print = nearest_print(prints_, fit->ratio);
-        const double by_curvature = ratio_by_curvature(*fit, print.ratio);
-        const double curvature = (fit->ratio - print.ratio) / by_curvature;
-        const double sigma = std::hypot(fit->ratio_sigma, print.sigma) / by_curvature;
-        if (std::abs(curvature) + sigma >= kMaxCurvature) continue;
-        least = std::min(least, square(sigma));
-        excess.push_back(square(curvature) / kMedianSquare - 2 * square(sigma));
+        const auto seen = curvature_of(*fit);
+        if (!seen) continue;
+        least = std::min(least, square(seen->sigma));
+        excess.push_back(square(seen->left) / kMedianSquare - 2 * square(seen->sigma));
     }
     surprise_ = 0;
     if (excess.empty()) return;

@@ -70,6 +70,11 @@ class CameraModel {
         return 255 * std::pow(std::max(level, 0.0) / 255, exponent);
     }
     void learn_remainder(const std::vector<ToneSample>& samples);
+    struct CurvatureSeen {
+        const Print& print;
+        double by_curvature, left, sigma;
+    };
+    std::optional<CurvatureSeen> curvature_of(const RoundelFit& fit) const;
     std::optional<ToneMeasurement> measure(const RoundelFit& fit) const;
     void learn_edge_noise(const std::vector<const RoundelFit*>& fits);
     void learn_curvature(const std::vector<const RoundelFit*>& fits);

@@ -17,7 +17,6 @@ constexpr double kMinMeasured = 12;      // pixels: ratio and blur of smaller ro
 constexpr size_t kMinWitnesses = 3;      // roundels that show something together, of which one may be wrong
 constexpr double kNewFrame = 0.2;        // weight of a new frame in what the camera's frames have shown
 constexpr double kMinCurvature = -0.25;  // of the tone curves of cameras
-constexpr double kContradiction = 3;     // standard deviations of a difference that is no chance
 
 /// Whether a roundel's ratio shows its print and the camera.
 inline bool is_measured(const RoundelFit& fit) { return fit.outer.major >= kMinMeasured && !fit.clipped; }

@@ -27,7 +27,6 @@ constexpr int kMaxMasked = 26;            // sectors of 32, of one edge
 constexpr int kMaxMaskedOfBoth = 44;      // sectors of 64, of both edges
 constexpr double kMaxRatioError = 0.01;   // from the nearest print, beside its uncertainty: shows a bias
 constexpr double kMaxRatioSigma = 0.005;  // of that uncertainty
-constexpr double kMinNew = 16;            // pixels: smaller new ones contain too little information
 
 // Levels in units of the contrast, from ink (0) to paper (1):
 constexpr double kForeign = 0.05;       // difference of a level that is neither of them

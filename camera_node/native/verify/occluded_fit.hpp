@@ -8,6 +8,8 @@
 
 namespace roundel {
 
+constexpr double kMinNew = 16;  // pixels: smaller rings that are covered or ragged may be letters
+
 /// Whether noise and a hundredth of the contrast explain the residuals on the ring's edges.
 bool is_explained_by_noise(const RoundelFit& fit, double noise);
 

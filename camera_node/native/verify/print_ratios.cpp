@@ -22,7 +22,6 @@ constexpr double kDotGain = 0.008;
 constexpr double kSharper = 0.7;    // factor of the standard deviation at which an estimate replaces the last
 constexpr double kExact = 0.01;     // standard deviation, from which an assigned print may change
 constexpr double kReplaced = 0.15;  // distance at which a print that recurs replaces a usual one
-constexpr size_t kUsed = 256;
 const std::vector<Print> kUsual{{0.6}, {0.41}};
 
 std::vector<Print> assumed_prints() {
@@ -84,7 +83,6 @@ bool PrintRatios::is_new(int track, double by_curvature) {
         used->by_curvature = by_curvature;
         return true;
     }
-    if (used_.size() >= kUsed) used_.erase(used_.begin());
     used_.push_back({track, by_curvature});
     return true;
 }
@@ -133,6 +131,10 @@ bool PrintRatios::collect() {
 }
 
 bool PrintRatios::learn(const std::vector<Observation>& roundels) {
+    std::erase_if(used_, [&](const Used& used) {
+        return std::ranges::none_of(roundels,
+                                    [&](const Observation& now) { return now.track == used.track; });
+    });
     std::array<size_t, kMaxKinds> seen{};
     for (const auto& [fit, track] : roundels) {
         if (!is_measured(*fit)) continue;
