@@ -324,10 +324,13 @@ def _allowed(S: Array, A: Array) -> float:
 
 
 def is_contradicted(none: Fit, n_cameras: int) -> bool:
-    """Whether errors of the cameras explain more than chance: the score test (Rao 1948) of all of them together."""
+    """Whether errors of the cameras explain more than chance, with those that the prior held back: the score test (Rao
+    1948) of all of them together, and how far the prior was stretched. With A the information of the window and x its
+    estimate, the sum is x^T (A^-1 + S)^-1 x, chi-square if the errors have the covariance S of the prior."""
     observed, gradient = none.reduced[:, :-1], none.reduced[:, -1]
     score = gradient @ np.linalg.solve(observed + np.diag(np.tile(FREE_SIGMA**-2, n_cameras)), gradient)
-    return bool(score > none.variance * chdtri(ERRORS * n_cameras, FALSE_ALARM))
+    stretched = none.errors.ravel() @ none.prior @ none.errors.ravel()
+    return bool(score + stretched > none.variance * chdtri(ERRORS * n_cameras, FALSE_ALARM))
 
 
 def decide(fits: Sequence[Fit], seeing: Sequence[int]) -> Verdict:

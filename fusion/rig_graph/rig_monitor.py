@@ -155,7 +155,7 @@ class RigMonitor:
             return ()
         return (
             Contradiction(
-                kind="undecided",
+                kind="undecided" if len(self.contradicting) > 1 else "camera",
                 names=self.contradicting,
                 error_over_claim=self._cameras.error_scale**2,
                 size_mm=1e3 * self._size_m,
@@ -224,23 +224,18 @@ class RigMonitor:
     def _act(
         self, window: Window, verdict: Verdict, measured: Measured | None, recalibrates: bool
     ) -> tuple[ExtrinsicsCorrection, ...]:
-        names = tuple(window.names[k] for k in verdict.cameras)
+        names = self._blamed(window, verdict)
         self.is_settled = verdict.cause != "clock"
         self._note_clocks(verdict, measured)
-        is_open = verdict.is_of_rig or (bool(names) and verdict.cause is None)
+        is_known = verdict.cause in ("pose", "clock")  # what is corrected
+        is_open = verdict.is_of_rig or (bool(names) and not is_known)
         self._n_undecided = self._n_undecided + 1 if is_open else 0
         # Keyframes from before the change may make any hypothesis look right.
         if self._n_undecided == 1 and not self._was_doubtful:
             self._keyframes.clear()
         self._is_contradicted = bool(names) or self._n_undecided == 1
-        if verdict.cause is None:
-            self._doubted |= set(names if names or not verdict.is_of_rig else window.names)
-            fall = AGREED_FALL if self._doubted <= set(_seeing(window)) else FALL
-            scales = next_scales(self._scale, self._cameras.error_scale, verdict, self._n_undecided > 1, fall)
-            self._scale, claimed = scales
-            if self._scale == claimed:
-                self._doubted.clear()
-            self._cameras.scale_errors(claimed)
+        if not is_known:
+            self._scale_claims(window, verdict, names)
         if names:
             self._size_m = _claim_m(window) * verdict.misfit**0.5
         self._note_undecided(names if self._n_undecided >= CONFIRMED else self._underrated())
@@ -257,10 +252,32 @@ class RigMonitor:
         self._use(name)
         return (*changes, placed)
 
+    def _blamed(self, window: Window, verdict: Verdict) -> tuple[str, ...]:
+        """The cameras that are at fault, or contradict each other: of three that see robots no single one, unless it is
+        known why; all, by errors that are larger than stated, only if they are stated."""
+        if verdict.cause is None and len(verdict.cameras) == 1 and len(_seeing(window)) <= MIN_FOR_PAIRS:
+            return tuple(_seeing(window))
+        if verdict.cause is None and verdict.fit.hypothesis.scale != 1.0 and not self._states_errors():
+            return ()
+        return tuple(window.names[k] for k in verdict.cameras)
+
+    def _scale_claims(self, window: Window, verdict: Verdict, names: tuple[str, ...]) -> None:
+        """Let claims count the errors of the rig as large as the window shows them."""
+        self._doubted |= set(names if names or not verdict.is_of_rig else window.names)
+        fall = AGREED_FALL if self._doubted <= set(_seeing(window)) else FALL
+        scales = next_scales(self._scale, self._cameras.error_scale, verdict, self._n_undecided > 1, fall)
+        self._scale, claimed = scales
+        if self._scale == claimed:
+            self._doubted.clear()
+        self._cameras.scale_errors(claimed)
+
+    def _states_errors(self) -> bool:
+        return any(c.errors or c.covariance for c in self._cameras.as_dict().values())
+
     def _underrated(self) -> tuple[str, ...]:
         """The cameras, if their errors are larger than the rig states; a rig may state none."""
-        stated = any(c.errors or c.covariance for c in self._cameras.as_dict().values())
-        return self._cameras.names if stated and self._cameras.error_scale >= LARGE else ()
+        is_large = self._cameras.error_scale >= LARGE
+        return self._cameras.names if is_large and self._states_errors() else ()
 
     def _returned(self, window: Window) -> tuple[ExtrinsicsCorrection, ...]:
         """The excluded cameras that agree with the others, as they were: nothing is at fault in the window."""
@@ -292,7 +309,13 @@ class RigMonitor:
 
     def _note_undecided(self, names: tuple[str, ...]) -> None:
         """Log cameras that contradict each other when that begins, and when it ends."""
-        if names and not self.contradicting:
+        if len(names) == 1 and names != self.contradicting:
+            log.warning(
+                "camera %s contradicts the other cameras: its lens changed, or it was moved; it is used as it is, "
+                "and poses claim less; calibrate it again",
+                *names,
+            )
+        elif names and not self.contradicting:
             log.warning(
                 "cameras %s contradict each other, and the robots do not show which of them is at fault; all are used "
                 "as they are, and poses claim less; move robots through all views, or calibrate again",

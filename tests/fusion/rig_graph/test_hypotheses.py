@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusion import _core
-from fusion.rig_graph.hypotheses import CAUSES, ERRORS, Hypothesis, decide, retract
+from fusion.rig_graph.hypotheses import CAUSES, ERRORS, Hypothesis, decide, is_contradicted, retract
 from tests.fusion.native.scene import ARRAY, CAMERAS, scene
 from tests.fusion.rig_graph.fits import fitted
 
@@ -95,6 +95,15 @@ def test_elimination_gives_the_solution_of_the_whole_system():
     np.testing.assert_allclose(step, whole[12 * bodies :], rtol=1e-8, atol=1e-10)
     of_bodies = by_body[:, :, -1] - by_body[:, :, :-1] @ step
     np.testing.assert_allclose(of_bodies.ravel(), whole[: 12 * bodies], rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize(("sigmas", "contradicts"), [(0.0, False), (4.0, False), (13.0, True)])
+def test_errors_far_beyond_their_prior_are_contradicted(sigmas: float, contradicts: bool):
+    """A fit explains residuals by errors that the prior hardly allows: 24 degrees of freedom, one in a million."""
+    none = fitted(None, (), 3, 0.0)
+    errors = none.errors.copy()
+    errors[1, 7] = sigmas
+    assert is_contradicted(replace(none, errors=errors), 3) == contradicts
 
 
 def test_the_camera_is_named_that_explains_more_than_every_other():

@@ -145,6 +145,7 @@ def test_a_process_that_judges_is_started_again_after_it_was_killed():
         ("bar 0.5 deg", 3, "undecided"),
         ("bar 0.5 deg", 4, "undecided"),
         ("turned 3 deg", 3, "right"),
+        ("focal +0.7 %", 4, "right"),
     ],
 )
 def test_no_other_camera_or_robot_is_reported(kind: str, cameras: int, reported: str):
