@@ -105,6 +105,8 @@ class RigMonitor:
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._was_doubtful = False
         self._moments: deque[tuple[FrameSet, Snapshot]] = deque()
+        self._given: tuple[dict[str, Camera], float, MarkerTable] = {}, 1.0, markers  # to the job
+        self._is_confirmed = False  # whether the job confirms a judgement
         self._size_m = 0.0  # of what contradicts, at the robots
         self._scale = (
             1.0  # of the rig's errors, accepted; claims may count them larger while nothing is decided
@@ -201,25 +203,32 @@ class RigMonitor:
         ):
             self._checked_ns = now.t_ns
             self._revision = self._cameras.revision
-            given = self._cameras.as_dict(), self._scale, tuple(self._moments)  # of this time
-            self._given_ns = kept[-1].t_ns
-            job = partial(judge_latest, tuple(kept), *given, self._markers, self._measured_ns)
-            self._job = _done(job) if self.executor is None else self.executor.submit(job)
-        if self._job is None or not self._job.done():
-            return ()
-        job, self._job = self._job, None
-        if self._revision != self._cameras.revision:
-            return ()
-        self._pause_ns = round((now.t_ns - self._checked_ns) / USUAL_SHARE)
-        try:
-            judged = job.result()
-        except Exception:  # of a process that ended, or of a singular system: the next keyframes are others
-            log.exception("the cameras can't be judged")
-            return ()
-        if judged is None:
-            self._is_contradicted = True
-            return ()
-        return self._act(*judged, recalibrates)
+            self._given = self._cameras.as_dict(), self._scale, self._markers  # of this time
+            self._given_ns, self._is_confirmed = kept[-1].t_ns, False
+            self._start(partial(judge_latest, tuple(kept), *self._given, self._measured_ns))
+        while self._job is not None and self._job.done():
+            job, self._job = self._job, None
+            if self._revision != self._cameras.revision:
+                return ()
+            self._pause_ns = round((now.t_ns - self._checked_ns) / USUAL_SHARE)
+            try:
+                judged = job.result()
+            except (
+                Exception
+            ):  # of a process that ended, or of a singular system: the next keyframes are others
+                log.exception("the cameras can't be judged")
+                return ()
+            if judged is None:
+                self._is_contradicted = True
+            elif self._is_confirmed or not _blames_one_of_three(*judged[:2]):
+                return self._act(*judged, recalibrates)
+            else:  # moments are several MB, which no other judgement needs
+                self._is_confirmed = True
+                self._start(partial(confirm, judged, *self._given, tuple(self._moments)))
+        return ()
+
+    def _start(self, job: Callable[[], Judgement | None]) -> None:
+        self._job = _done(job) if self.executor is None else self.executor.submit(job)
 
     def _act(
         self, window: Window, verdict: Verdict, measured: Measured | None, recalibrates: bool
@@ -397,26 +406,37 @@ def judge_latest(
     keyframes: Sequence[Keyframe],
     cameras: Mapping[str, Camera],
     error_scale: float,
-    moments: Sequence[tuple[FrameSet, Snapshot]],
     markers: MarkerTable,
     since_ns: int,
 ) -> Judgement | None:
     """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
-    cameras' errors is measured. Of three cameras one is at fault only if `moments` show it."""
+    cameras' errors is measured."""
     array = CameraArray(dict(cameras), error_scale)
     for n in WINDOWS:
         if n <= len(keyframes):
             window, starts = window_of(keyframes[-n:], array, markers)
             verdict = judge(window, starts)
-            if (
-                verdict.cause == "pose"
-                and len(_seeing(window)) <= MIN_FOR_PAIRS
-                and not _moved_alone(Moments(*zip(*moments, strict=True)), (array, markers), window, verdict)
-            ):
-                verdict = replace(verdict, cause=None, cameras=tuple(np.unique(window.camera).tolist()))
             if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict, _measure(window, verdict, keyframes[-n:], since_ns)
     return None
+
+
+def _blames_one_of_three(window: Window, verdict: Verdict) -> bool:
+    return verdict.cause == "pose" and len(_seeing(window)) <= MIN_FOR_PAIRS
+
+
+def confirm(
+    judged: Judgement,
+    cameras: Mapping[str, Camera],
+    error_scale: float,
+    markers: MarkerTable,
+    moments: Sequence[tuple[FrameSet, Snapshot]],
+) -> Judgement:
+    """The judgement that one of three cameras is at fault if `moments` show that it moved; else an undecided one."""
+    (window, verdict, measured), scene = judged, (CameraArray(dict(cameras), error_scale), markers)
+    if moments and _moved_alone(Moments(*zip(*moments, strict=True)), scene, window, verdict):
+        return judged
+    return window, replace(verdict, cause=None, cameras=tuple(np.unique(window.camera).tolist())), measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)

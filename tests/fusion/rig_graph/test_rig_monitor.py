@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from camera_node.geometry.pose import rotation_from_vector
+from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame
 from fusion.rig_graph.rig_monitor import JudgeProcess
@@ -19,7 +19,7 @@ from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.trust import Case, run
 from tests.fusion.moved_camera import MOTIONS, MOVE_S, ROBOTS, black, moved
-from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena
+from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, ring
 from tests.fusion.tracks import errors
 
 DEADLINE_S = 60.0  # of a process that starts on a busy machine
@@ -103,6 +103,21 @@ def test_of_four_cameras_one_of_which_is_silent_the_moved_one_is_found():
     corrections, states = follow(Tracker(before.cameras, ROBOTS), [f for f in frames if f.camera != "cam3"])
     assert [(c.name, c.camera is None) for c in corrections] == [("cam1", True), ("cam1", False)]
     assert states == ["tracked"] * len(ROBOTS)
+
+
+def test_of_many_cameras_of_which_three_see_robots_none_is_blamed(caplog):
+    """Nothing is remembered that would show which of them moved: the judgement ended in an exception."""
+    cameras = ring(5)
+    T = cameras["cam1"].matrix()
+    T[:3, :3] = T[:3, :3] @ rotation_from_vector([0.03, 0.02, 0.0])
+    turned = msgspec.structs.replace(cameras["cam1"], T_world_cam=Pose.from_matrix(T))
+    after = Arena(ROBOTS, MOTIONS, cameras=cameras | {"cam1": turned}, sigma_px=0.1)
+    before = Arena(ROBOTS, MOTIONS, cameras=cameras, sigma_px=0.1)
+    frames = [f for f in before.frames(60) if before.seconds(f.t_ns) < MOVE_S]
+    frames += [f for f in after.frames(60) if before.seconds(f.t_ns) >= MOVE_S]
+    corrections, _ = follow(Tracker(cameras, ROBOTS), [f for f in frames if f.camera != "cam3"])
+    assert corrections == []
+    assert "can't be judged" not in caplog.text
 
 
 def test_robots_are_found_while_claims_count_large_errors_and_these_end():
