@@ -67,6 +67,16 @@ class Message(NamedTuple):
     t_ns: int
 
 
+class ChunkHeader(NamedTuple):
+    """What a chunk states of itself: sizes in bytes, and the time of arrival of its last message."""
+
+    compression: str
+    compressed: int
+    size: int
+    check_sum: int
+    end_ns: int
+
+
 class FilePart(NamedTuple):
     """A part of the file: a chunk or another record, or bytes that can't be read.
 
@@ -280,8 +290,8 @@ class RecordingReader:
         end = start + RECORD.size + length
         if end > self._end:
             return None
-        if (sizes := self._chunk_sizes(length)) is not None:
-            return self._read_chunk(start, end, opcode, *sizes)
+        if (header := self._chunk_header(length)) is not None:
+            return self._read_chunk(start, end, opcode, header)
         if opcode in SKIPPED or opcode >= PRIVATE or (opcode == Opcode.DATA_END and length == 4):
             return FilePart(start, end, opcode, None if opcode == SET_ASIDE else b"")
         is_misplaced = start == len(MAGIC) and opcode != Opcode.HEADER  # which each file begins with
@@ -304,8 +314,8 @@ class RecordingReader:
         self.has_header = True
         return True
 
-    def _chunk_sizes(self, length: int) -> tuple[str, int, int, int, int] | None:
-        """Compression, compressed size, size, check sum and last time of the chunk whose content begins here; or None.
+    def _chunk_header(self, length: int) -> ChunkHeader | None:
+        """The header of the chunk whose content begins here; else None.
 
         The opcode has no part in it: the sizes agree by chance in no other record.
         """
@@ -320,21 +330,11 @@ class RecordingReader:
         compressed = int.from_bytes(content[CHUNK.size + n : CHUNK.size + n + 8], "little")
         if CHUNK.size + n + 8 + compressed != length:
             return None
-        return compression.decode(), compressed, size, check_sum, end_ns
+        return ChunkHeader(compression.decode(), compressed, size, check_sum, end_ns)
 
-    def _read_chunk(
-        self,
-        start: int,
-        end: int,
-        opcode: int,
-        compression: str,
-        compressed: int,
-        size: int,
-        check_sum: int,
-        end_ns: int,
-    ) -> FilePart:
-        chunk = compression, compressed, size
-        is_earlier = self.from_ns is not None and self.is_complete and end_ns < self.from_ns
+    def _read_chunk(self, start: int, end: int, opcode: int, header: ChunkHeader) -> FilePart:
+        chunk = compression, compressed, size = header[:3]
+        is_earlier = self.from_ns is not None and self.is_complete and header.end_ns < self.from_ns
         if is_earlier or compressed > self.limits.chunk_bytes:
             return FilePart(start, end, opcode, b"", chunk)
         self.file.seek(end - compressed)
@@ -347,7 +347,7 @@ class RecordingReader:
             records = _decompress(data, compression, size)
         except Exception:  # whatever the decompressor raises: the chunk is damaged
             records = None
-        if records is not None and (len(records) != size or check_sum not in (0, zlib.crc32(records))):
+        if records is not None and (len(records) != size or header.check_sum not in (0, zlib.crc32(records))):
             records = None
         return FilePart(start, end, opcode, records, chunk)
 

@@ -157,7 +157,7 @@ def _without_numpy(value: Any) -> Any:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file so that a reader sees either the old content or the new one; text is encoded in UTF-8.
 
-    What a symbolic link points to is written, and an older file's permissions are kept.
+    What a symbolic link points to is written, with the permissions of the older file.
 
     Raises:
         ConfigError: the folder does not exist or is not writable.

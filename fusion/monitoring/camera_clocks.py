@@ -24,7 +24,7 @@ log = logging.getLogger("fusion")
 ClockState = Literal["correct", "uncertain", "corrected"]
 REPORTED_S = 0.0005  # smallest correction that is reported; later ones when it has doubled
 MAX_MOTION_M = 0.005  # of a robot in the standard deviation of a camera's clock, so that it locates the robot
-CERTAIN = 3.0  # standard deviations of a clock
+CERTAIN = 3.0  # standard deviations by which a correction may be wrong before a lag contradicts it: 1 in 700
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
 
 
@@ -123,7 +123,8 @@ class CameraClocks:
     def _refute(self, frame: CalibratedFrame) -> tuple[float, float]:
         """Forget a correction by which a frame would arrive long before it was sent: the stamps jumped back, unnoticed
         so soon after the jump before. The standard deviation of the clock is the correction."""
-        wrong_s, rate = self._clocks[frame.camera].at(frame.t_ns), self._clocks[frame.camera].rate
+        wrong = self._clocks[frame.camera]
+        wrong_s = wrong.at(frame.t_ns)
         if frame.t_ns + 1e9 * wrong_s <= frame.received_ns + MAX_AHEAD_NS or not wrong_s:
             return 0.0, 0.0
         self.reset(frame.camera)
@@ -134,7 +135,7 @@ class CameraClocks:
             *(frame.camera, 1e3 * wrong_s),
             extra=about(frame.camera),
         )
-        return abs(wrong_s), abs(rate)
+        return abs(wrong_s), abs(wrong.rate)
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None if that time is in the future."""
@@ -162,9 +163,8 @@ class CameraClocks:
         """Let no rate be common to most clocks from a time on: robots show differences only, and each departure may
         leave a part of its rate with the others, which would move all robots along their paths for ever."""
         rates = [clock.rate for clock in self._clocks.values()]
-        common = min(
-            max(0.0, median_low(rates)), median_high(rates)
-        )  # of the medians the one nearest to none
+        # Of the medians the one nearest to none.
+        common = min(max(0.0, median_low(rates)), median_high(rates))
         for clock in self._clocks.values() if common else ():
             clock.correction_s, clock.since_ns = clock.at(t_ns), t_ns
             clock.rate -= common

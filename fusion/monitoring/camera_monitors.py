@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Decides which frames of which cameras are used: clocks, frozen images, moved cameras."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from calib.rig.camera import Camera
@@ -38,18 +39,20 @@ class CameraMonitors:
         self.frozen.inherit(old.frozen)
         self.rig.inherit(old.rig)
 
-    def admit(self, frame: CalibratedFrame, now: Snapshot | None) -> CalibratedFrame | None:
+    def admit(
+        self, frame: CalibratedFrame, robots_now: Callable[[], Snapshot | None]
+    ) -> CalibratedFrame | None:
         """A frame in corrected time; None while its camera is withheld, or if that time is in the future.
 
         Args:
             frame: the next one of its camera.
-            now: the robots at the last frame set; None before the first.
+            robots_now: the robots at the last frame set; None before the first.
         """
         sigmas = self.clocks.observe(frame)
         if any(sigmas):
             self.rig.jump(frame.camera, *sigmas)
         admitted = self.clocks.admit(frame)
-        return None if admitted is None or self.frozen.is_frozen(admitted, now) else admitted
+        return None if admitted is None or self.frozen.is_frozen(admitted, robots_now) else admitted
 
     def used(self, frame_set: FrameSet, speed_m_s: float) -> FrameSet:
         """The frame set without the frames of moved cameras, and of those whose time is not known at this speed."""

@@ -7,6 +7,7 @@ identical detections count only once a robot that they show has moved.
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,12 +56,12 @@ class FrozenImages:
         """Continue with the same cameras and other robots."""
         self._runs = {name: _Run(run.first, is_frozen=run.is_frozen) for name, run in old._runs.items()}
 
-    def is_frozen(self, frame: CalibratedFrame, now: Snapshot | None) -> bool:
+    def is_frozen(self, frame: CalibratedFrame, robots_now: Callable[[], Snapshot | None]) -> bool:
         """Whether the image of this frame is an old one; logs when that begins and ends.
 
         Args:
             frame: the next one of its camera.
-            now: the robots at the last frame set; None before the first.
+            robots_now: the robots at the last frame set; None before the first. Called if images are identical.
         """
         name, run = frame.camera, self._runs.get(frame.camera)
         if run is None or not _are_identical(run.first.roundels, frame.roundels):
@@ -68,6 +69,7 @@ class FrozenImages:
                 log.info("camera %s delivers new images again", name, extra=about(name))
             self._runs[name] = _Run(frame)
             return False
+        now = robots_now()
         moved = self._has_moved(run, frame, now) if now is not None else None
         if moved and not run.is_frozen:
             at = time.strftime("%H:%M:%S", time.localtime(run.first.t_ns * 1e-9))

@@ -19,10 +19,8 @@ from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, RIVAL
 
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock
 RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crystals have 1e-4, bad drivers more
-CHANGED_SIGMA = (
-    0.1,
-    1e-2,
-)  # of an offset, s, and a rate that changed: cameras have stated rates that are 1 % wrong
+# Of an offset, s, and a rate that changed: cameras have stated rates that are 1 % wrong.
+CHANGED_SIGMA = 0.1, 1e-2
 RATE_WALK = 1e-4  # change of a rate in a second: a daemon that slews a clock changes it by 5e-4 at once
 MEMORY_S = 10.0  # of errors of poses and lenses: what they do to offsets varies with the places of robots
 
@@ -176,7 +174,7 @@ class ClockWalk:
             Departure(k, self._t_ns, *a.tolist(), *b.tolist())
             for k, a, b in zip(self.departed, alone, sigma, strict=True)
         ]
-        known = [
+        others_now = [  # whose corrections stay, as well known as now
             Departure(k, self._t_ns, 0.0, 0.0, *explain([k])[2][0].tolist())
             for k in self._corrected.difference(self.departed)
         ]
@@ -184,4 +182,4 @@ class ClockWalk:
             self.departed = [
                 d.camera for d in departures if d.sigma_s > OFFSET_SIGMA_S or d.rate_sigma > RATE_SIGMA / 2
             ]
-        return (*departures, *known)
+        return (*departures, *others_now)

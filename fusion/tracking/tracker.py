@@ -107,10 +107,11 @@ class Tracker:
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None while its camera is withheld, or if that time is in the future."""
-        t_ns, table = self.table.t_ns, self.table
-        return self.monitors.admit(
-            frame, None if t_ns is None else Snapshot(t_ns, table.states, table.located)
-        )
+        return self.monitors.admit(frame, self._robots_now)
+
+    def _robots_now(self) -> Snapshot | None:
+        t_ns = self.table.t_ns
+        return None if t_ns is None else Snapshot(t_ns, self.table.states, self.table.located)
 
     def track(self, frame_set: FrameSet) -> TrackingResult:
         """Track all robots and markers through a complete frame set."""

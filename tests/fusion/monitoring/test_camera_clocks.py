@@ -42,7 +42,7 @@ def test_a_clock_that_jumps_is_reported_and_corrected(step_ms: float):
 @pytest.mark.parametrize("lasts_s", [1.0, 0.3])
 def test_a_jump_that_ends_is_corrected_once_more(lasts_s: float):
     """By 15 intervals, like 15 missing frames: only the correction shows that they would arrive before they were sent.
-    Where too few frames have told what is usual, the correction is dropped, and the robots show the clock."""
+    Where too few frames show what is usual, the correction is dropped, and the robots show the clock."""
     back_s = FAULT_S + lasts_s
     outcome = fuse(LOAD, 5.0, {"cam1": lambda t_s: -0.5 * (FAULT_S <= t_s < back_s)})
     assert outcome.wrong(FAULT_S + GRACE_S) == []
@@ -106,7 +106,7 @@ def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, du
 
 
 def test_a_drift_that_ends_is_not_corrected_any_more():
-    """The clock is set, so its rate may have ended: kept, it made poses wrong for 15 s."""
+    """The clock is set, so its rate may have ended: poses were wrong for 15 s after that."""
     load, set_s = replace(LOAD, robots=6, speed_m_s=0.5), FAULT_S + 3.0
     outcome = fuse(load, 8.5, {"cam1": lambda t_s: 5e-3 * (t_s - FAULT_S) * (FAULT_S <= t_s < set_s)})
     assert outcome.wrong(FAULT_S + GRACE_S) == []
