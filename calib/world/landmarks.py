@@ -188,9 +188,15 @@ def locate_landmarks(
     needed = min(3, len(landmarks))
     if max((h.count for h in hypotheses), default=0) < needed:
         counts = ", ".join(f"{name} {sum(r.camera == name for r in roundels)}" for name in sorted(cameras))
+        found = _most_seen(cameras, roundels, points)
+        if len(found) < needed:
+            raise CalibrationError(
+                f"two cameras together see only {len(found)} roundels that keep still, and {needed} of {of} are needed "
+                f"(stationary roundels by camera: {counts}); lay all in the view of two cameras, and move nothing"
+            )
         raise CalibrationError(
             f"no {needed} of the stationary roundels (by camera: {counts}) have the distances of {of}: "
-            f"{_explain_distances(_most_seen(cameras, roundels, points), surveyed)}"
+            f"{_explain_distances(found, surveyed)}"
         )
     hypotheses.sort(key=lambda h: (h.count, -h.distance_px), reverse=True)
     _check_unique(hypotheses, of)
@@ -199,9 +205,6 @@ def locate_landmarks(
 
 def _explain_distances(points: Array, surveyed: Array) -> str:
     """What is seen in place of the landmarks, and what to do."""
-    needed = min(3, len(surveyed))
-    if len(points) < needed:
-        return f"two cameras together see only {len(points)} roundels that keep still; let two cameras see all of them"
     expected = _list_distances(surveyed)
     if len(points) > MAX_LISTED:
         return f"these are {expected}; measure them again, and check the scale of the calibration"

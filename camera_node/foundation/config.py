@@ -119,7 +119,12 @@ def _name_entry(data: Any, kind: type, fault: str) -> str:
 
 
 def _suggest(kind: type, fault: str) -> str:
-    """For an unknown field: the known field with the most similar name, or all known fields. Empty for other faults."""
+    """For an unknown field: the known field with the most similar name, or all known fields. For a text in place of a
+    number, such as 9 cm, or a number in place of a list: how to write it. Empty for other faults."""
+    if re.match("Expected `(int|float)[^`]*`, got `str`", fault):
+        return "; give a number, without quotes and without a unit"
+    if re.match("Expected `array[^`]*`, got `(int|float)`", fault):
+        return "; give a list there, such as [[x, y, z]] for one marker"
     match = re.fullmatch(r"Object contains unknown field `([^`]*)`(?: - at `\$(.*)`)?", fault)
     known = _fields(msgspec.inspect.type_info(kind), (match[2] or "").split(".")[1:]) if match else []
     if not match or not known:
@@ -275,7 +280,10 @@ def parse_yaml(text: bytes, path: Path, foreign: bool = False) -> Any:
         ArithmeticError,
     ) as error:  # the last two of impossible dates and numbers
         where = " ".join(str(error).replace('in "<byte string>", ', "at ").split())
-        raise ConfigError(f"{path} is not valid YAML: {where}") from None
+        # What YAML says of a tab does not name it.
+        tabs = [str(k) for k, line in enumerate(text.splitlines(), 1) if b"\t" in line[: -len(line.lstrip())]]
+        advice = f"; indent line {tabs[0]} with spaces in place of a tab" if tabs else ""
+        raise ConfigError(f"{path} is not valid YAML: {where}{advice}") from None
 
 
 def _read_bounded(path: Path) -> bytes:

@@ -109,10 +109,9 @@ class Summary:
             why = f"; at the end: {self.not_acquired[robot]}" if robot in self.not_acquired else ""
             yield f"{robot}: {', '.join(shares)}{why}"
         for name in sorted(self.used):
-            rms = np.sqrt(self.squared_px[name] / self.used[name]) if self.used[name] else np.nan
-            yield (
-                f"{name}: residual {rms:.2f} px, {self.used[name]} detections assigned, {self.unused[name]} not"
-            )
+            used = self.used[name]
+            residual = f"residual {np.sqrt(self.squared_px[name] / used):.2f} px, " if used else ""
+            yield f"{name}: {residual}{used} detections assigned, {self.unused[name]} not"
         for reason, count in sorted(self.faults.items()):
             yield f"skipped: {count} {reason}"
         yield from self.moves
@@ -169,7 +168,11 @@ def _fuse(
             summary.add_correction(correction, frame_set.t_ns)
     summary.not_acquired = tracker.not_acquired()
     if not summary.frame_sets:
-        raise FusionError(f"no frame could be used{skipped(summary.faults)}; nothing was written")
+        placed = ", ".join(sorted(arena.cameras))
+        raise FusionError(
+            f"no frame could be used{skipped(summary.faults)}; give the rig of these cameras at this size (this one "
+            f"has poses of {placed}); nothing was written"
+        )
     if smoother is not None:
         yield from smoother.finish()
 

@@ -80,9 +80,11 @@ def main(pictures: Path | None = None, recording: Path | None = None) -> None:
             outcome = play(arena, folder, show)
     circle = outcome.circle
     print(
-        f"{outcome.calibration}\n{outcome.clicks} clicks, 2 commands, {outcome.seconds:.0f} s from the page to "
-        f"{outcome.n_poses} poses of a robot that drives, of which the script of the motions took {arena.times:.1f} "
-        f"times {sum(phase.seconds for phase in PHASES[:-1]):.0f} s to its start\n"
+        f"{outcome.calibration}\n"
+        f"{outcome.clicks} clicks, of which {outcome.repeated} repeat a measurement, 2 commands, "
+        f"{outcome.seconds:.0f} s from the page to {outcome.n_poses} poses of a robot that drives, of which the "
+        f"script of the motions took {arena.times:.1f} times {sum(phase.seconds for phase in PHASES[:-1]):.0f} s to "
+        f"its start\n"
         f"{outcome.n_poses} poses: radius {1e3 * circle.radius_m:.2f} of "
         f"{1e3 * RADIUS_M:.0f} mm, centre {1e3 * np.linalg.norm(circle.centre_m - CENTRE_M):.2f} mm off, "
         f"{1e3 * circle.rms_m:.2f} mm RMS from the circle, {circle.round_s:.3f} s a round"

@@ -26,7 +26,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
-from playwright.sync_api import Locator, Page, expect, sync_playwright
+from playwright.sync_api import Locator, Page, TimeoutError, expect, sync_playwright
 
 from calib.rig.rig import load_rig
 from camera_node.foundation.arrays import Array, Grey
@@ -48,6 +48,7 @@ ROUND_S = 12.0
 RADIUS_M = 0.6  # of the circle on which the robot drives
 DIAMETER_M = 0.09
 MARKERS = [[0.1, 0.0, 0.0], [-0.08, 0.05, 0.0], [-0.03, -0.11, 0.0]]  # of the robot
+LOOK_MS = 5_000  # of an operator, at the outcome of a measurement, before the next click
 STEP_MS = 60_000  # for the page to show the outcome of a step, on a loaded machine
 CALIBRATION_MS = 150_000
 LONG_ENOUGH = r"^(3[6-9]|[4-9]\d|1\d\d) s[:;]"  # three rounds of the wand
@@ -173,9 +174,10 @@ class Operator:
 
     Attributes:
         clicks: so far, with those on tabs; a text that is typed is none.
+        repeated: those of them that repeat a measurement.
     """
 
-    clicks = 0
+    clicks, repeated = 0, 0
 
     def __init__(
         self, page: Page, wait_for: Callable[[str], object], picture: Callable[[str], object]
@@ -251,13 +253,18 @@ class Operator:
         self._press(self._button(name))
 
     def _click_until(self, name: str, outcome: Locator) -> None:
-        """Click a button, and again if it is enabled without the outcome: something moved, or was not there yet."""
+        """Click a button, and again if it is enabled without the outcome: something moved, or was not there yet.
+
+        The button is disabled while it measures, which a browser that draws seldom may never show.
+        """
         for _ in range(60):
             self._click(name)
-            expect(self._button(name)).to_be_disabled(timeout=STEP_MS)  # it measures
+            with contextlib.suppress(TimeoutError):
+                outcome.wait_for(timeout=LOOK_MS)
             outcome.or_(self._page.locator("button:enabled", has_text=name)).first.wait_for(timeout=STEP_MS)
             if outcome.count():
                 return
+            self.repeated += 1
         raise AssertionError(f"{name} had no outcome")
 
     def _press(self, control: Locator) -> None:
@@ -395,6 +402,7 @@ class Outcome:
         circle: through the positions that the program printed while the robot drove.
         n_poses: their number.
         clicks: of the operator.
+        repeated: those of them that repeat a measurement, because the body is not there yet.
         seconds: from the open page to the last pose.
     """
 
@@ -403,6 +411,7 @@ class Outcome:
     circle: Circle
     n_poses: int
     clicks: int
+    repeated: int
     seconds: float
 
 
@@ -435,6 +444,7 @@ def play(arena: FirstArena, folder: Path, picture: Callable[[Page, str], object]
         fit_circle(t_ns, positions),
         len(t_ns),
         operator.clicks,
+        operator.repeated,
         seconds,
     )
 
