@@ -21,8 +21,7 @@ from camera_node.detection.relative_positions import DiscLocalizer
 from camera_node.detection.roundels import LocatedRoundels
 from camera_node.geometry.lens import Lens
 from formation.live_formation import FormationScore
-from tests.camera_node.rendering import expose
-from tests.camera_node.tracing import Sight, pixels_across, trace
+from tests.camera_node.tracing import Sight, expose, pixels_across, trace
 from tests.examples.lockstep import run_lockstep
 
 DIAMETER_M, FOCAL_PX, NOISE = 0.1, 600.0, 2.5

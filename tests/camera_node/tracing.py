@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from camera_node.foundation.arrays import Array
+from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry import codes
 from camera_node.geometry.lens import Lens
 
@@ -161,3 +161,8 @@ def ellipse_of(sight: Sight) -> tuple[Array, Array]:
     dual /= dual[2, 2]
     centre = dual[:2, 2]
     return centre, 2 * np.sqrt(np.linalg.eigvalsh(np.outer(centre, centre) - dual[:2, :2])[::-1])
+
+
+def expose(image: Array, noise: float, rng: np.random.Generator) -> Grey:
+    """An 8-bit image with Gaussian noise."""
+    return np.clip(np.rint(image + rng.normal(0, noise, image.shape)), 0, 255).astype(np.uint8)

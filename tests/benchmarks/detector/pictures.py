@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Renders images of cards: backgrounds, and ray-traced cards on them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -15,6 +16,7 @@ from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace
 F = 600.0  # default focal length, pixels
 NOISE = 3.0  # default noise, grey levels
 PIECES = 4  # samples per pixel in either direction
+SMALL = (120, 160)  # default size (h, w) of a picture of a few cards
 
 
 def dead_leaves(size: tuple[int, int], rng: np.random.Generator) -> Array:
@@ -65,7 +67,7 @@ def paste(
 ) -> Array:
     """The image (h, w), blurred, with cards on it; each occludes the ground by its coverage of a pixel."""
     h, w = image.shape
-    out = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), float)
+    out = np.array(cv2.GaussianBlur(image, (0, 0), blur) if blur else image, float)
     for card in cards:
         sight = sight_of(card, (w, h), focal)
         box = _bound(sight, blur)
@@ -73,6 +75,23 @@ def paste(
         part = out[box[1] : box[3], box[0] : box[2]]
         part += light - cover * part
     return out
+
+
+def render(
+    cards: Sequence[Card],
+    size: tuple[int, int] = SMALL,
+    *,
+    ground: float = 90.0,
+    light: Array | None = None,
+    **options: float,
+) -> Array:
+    """Cards on an even ground, (h, w); `options` are those of `paste`."""
+    return paste(flat(size, float(ground)), list(cards), **options)
+
+
+def outline_of(card: Card, size: tuple[int, int] = SMALL) -> tuple[Array, Array]:
+    """Centre (2,) and full axes (2,) of the outer ellipse of a card in an image of size (h, w), pixels."""
+    return ellipse_of(sight_of(card, (size[1], size[0])))
 
 
 def sight_of(card: Card, size: tuple[int, int], focal: float = F) -> Sight:

@@ -15,7 +15,7 @@ from camera_node.commands.camera_check import check_camera
 from camera_node.commands.camera_command import JoinArena
 from camera_node.foundation.errors import ConfigError
 from camera_node.sources.frame import SourceSettings
-from tests.camera_node.rendering import Disc, render
+from tests.benchmarks.detector.pictures import Card, render
 from tests.conftest import ROOT
 
 PERIOD_NS = 20_000_000
@@ -24,7 +24,7 @@ PERIOD_NS = 20_000_000
 def write_frames(folder: Path, stamps: list[int], light: float = 1.0) -> str:
     """A folder of frames with one roundel in the middle; its path."""
     folder.mkdir()
-    image = np.rint(light * render([Disc((80.0, 60.0), 30, 0.5, 0.7)])).astype(np.uint8)
+    image = np.rint(light * render([Card((80.0, 60.0), 30, 0.5, 0.7)])).astype(np.uint8)
     for t_ns in stamps:
         cv2.imwrite(str(folder / f"{t_ns}.png"), image)
     return str(folder)

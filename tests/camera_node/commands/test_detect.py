@@ -10,13 +10,14 @@ import pytest
 
 from camera_node.commands.detect import Detect
 from camera_node.foundation.errors import CameraError, ConfigError
-from tests.camera_node.rendering import Disc, expose, render
+from tests.benchmarks.detector.pictures import Card, render
+from tests.camera_node.tracing import expose
 
 
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
     path = tmp_path / "frame.png"
-    cv2.imwrite(str(path), expose(render([Disc((80, 60), 40, 0.5)]), 2, np.random.default_rng(1)))
+    cv2.imwrite(str(path), expose(render([Card((80, 60), 40, 0.5)]), 2, np.random.default_rng(1)))
     return path
 
 

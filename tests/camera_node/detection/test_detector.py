@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from camera_node import _core
 from camera_node.detection.detector import Detector
 from camera_node.foundation.errors import ConfigError
-from tests.camera_node.rendering import Disc, expose, outer_conic, render
-
-PRINCIPAL = np.array([79.5, 59.5])
+from tests.benchmarks.detector.pictures import Card, F, outline_of, render
+from tests.camera_node.tracing import expose
 
 
 def rng(seed: int = 1) -> np.random.Generator:
@@ -25,11 +24,11 @@ def rng(seed: int = 1) -> np.random.Generator:
 def test_without_noise_only_rounding_errors_remain(diameter: float, tilt_deg: float, blur: float):
     """Centre within 0.02 px (rounding to grey levels has a standard deviation of 0.29), axes 1.5 %, ratio 0.02."""
     for u, v in rng().uniform(50, 70, (3, 2)):
-        disc = Disc((u + 20, v), diameter, np.radians(tilt_deg), turn=0.7)
+        disc = Card((u + 20, v), diameter, np.radians(tilt_deg), turn=0.7)
         if diameter * np.cos(disc.tilt) < 5.5 + 8 * blur:
             continue  # blur hides the card's margin, a seventh of this
         (found,) = Detector().detect(expose(render([disc], blur=blur), 0, rng()))
-        centre, axes = outer_conic(disc, PRINCIPAL)
+        centre, axes = outline_of(disc)
         assert np.abs(found.uv - centre).max() < 0.02
         assert np.allclose(found.axes_px, axes, rtol=0.015)
         assert abs(found.ratio - 0.6) < 0.02
@@ -42,8 +41,8 @@ def test_reported_covariance_is_consistent():
     """
     generator, squared = rng(), []
     for turn in np.linspace(0, 3, 10):
-        disc = Disc((80.3 + turn, 60.6), 16 + turn, 0.6, turn)
-        clean, (centre, _) = render([disc]), outer_conic(disc, PRINCIPAL)
+        disc = Card((80.3 + turn, 60.6), 16 + turn, 0.6, turn)
+        clean, (centre, _) = render([disc]), outline_of(disc)
         for _ in range(20):
             (found,) = Detector().detect(expose(clean, 3, generator))
             error = found.uv - centre
@@ -53,7 +52,7 @@ def test_reported_covariance_is_consistent():
 
 def test_the_inner_ellipse_gives_the_centre_of_the_disc():
     """At 60 px and 45 degrees it is 1 px from the ellipse's centre; the measured offset is within four sigmas."""
-    disc = Disc((80.2, 60.4), 60, np.radians(45), turn=0.4)
+    disc = Card((80.2, 60.4), 60, np.radians(45), turn=0.4)
     (found,) = Detector().detect(expose(render([disc]), 1, rng()))
     offset, cov = found.offset_px, found.pose_cov
     assert offset is not None
@@ -66,15 +65,15 @@ def test_the_inner_ellipse_gives_the_centre_of_the_disc():
 
 def test_shadow_and_gradient():
     """The light decreases to 0.4 across the image, and a shadow halves it in a part."""
-    discs = [Disc((25 + 45 * i, 25 + 40 * j), 22) for i in range(3) for j in range(2)]
+    discs = [Card((25 + 45 * i, 25 + 40 * j), 22) for i in range(3) for j in range(2)]
     light = np.tile(np.linspace(1, 0.4, 160), (120, 1))
     light[:, 48:92] *= 0.5
-    found = Detector().detect(expose(render(discs, bright=230, light=light), 2, rng()))
+    found = Detector().detect(expose(light * render(discs, bright=230), 2, rng()))
     assert len(found) == 6
 
 
 def test_adjacent_roundels_do_not_disturb_each_other():
-    discs = [Disc((20 + 24 * i, 20 + 24 * j), 14) for i in range(6) for j in range(4)]
+    discs = [Card((20 + 24 * i, 20 + 24 * j), 14) for i in range(6) for j in range(4)]
     found = Detector().detect(expose(render(discs), 2, rng()))
     apart = np.linalg.norm(found.uv[:, None] - [disc.uv for disc in discs], axis=2)
     assert len(found) == 24
@@ -83,12 +82,12 @@ def test_adjacent_roundels_do_not_disturb_each_other():
 
 @pytest.mark.parametrize("ratio", [0.6, 0.41, 0.35])
 def test_the_common_prints_are_found_by_default(ratio: float):
-    assert len(Detector().detect(expose(render([Disc((80, 60), 30, ratio=ratio)]), 2, rng()))) == 1
+    assert len(Detector().detect(expose(render([Card((80, 60), 30, ratio=ratio)]), 2, rng()))) == 1
 
 
 def test_a_roundel_on_a_dark_round_plate_is_found():
     """One dark ring around a card may be a plate below it; two make a bullseye."""
-    card = render([Disc((80, 60), 30)], ground=40)
+    card = render([Card((80, 60), 30)], ground=40)
     v, u = np.mgrid[:120, :160]
     plate = np.where(np.hypot(u - 80, v - 60) < 30, card, 150)
     assert len(Detector().detect(expose(plate, 2, rng()))) == 1
@@ -146,34 +145,34 @@ def test_drawn_circles_are_found(line: int, blur: float, radius: int):
 
 def test_clutter_that_touches_the_card_costs_no_accuracy():
     """A bright and a dark bar across the surround: the error of the centre is below 0.05 px, a few sigmas."""
-    disc = Disc((80.3, 59.8), 24, 0.5, 0.3)
+    disc = Card((80.3, 59.8), 24, 0.5, 0.3)
     image = render([disc], blur=0)
     image[:, 95:99] = 250
     image[75:80] = 20
     (found,) = Detector().detect(expose(cv2.GaussianBlur(image, (0, 0), 0.7), 2, rng()))
-    assert np.abs(found.uv - outer_conic(disc, PRINCIPAL)[0]).max() < 0.05
+    assert np.abs(found.uv - outline_of(disc)[0]).max() < 0.05
 
 
 def test_a_track_stays_with_its_roundel():
     detector, numbers = Detector(), []
     for k in range(4):
-        discs = [Disc((30 + 5 * k, 40), 20), Disc((120 - 5 * k, 80), 20)]
+        discs = [Card((30 + 5 * k, 40), 20), Card((120 - 5 * k, 80), 20)]
         found = detector.detect(expose(render(discs), 2, rng()))
         numbers.append(found.track[np.argsort(found.uv[:, 1])].tolist())
     assert numbers == [numbers[0]] * 4
     assert len(set(numbers[0])) == 2
-    far = detector.detect(expose(render([Disc((80, 20), 20)]), 2, rng()))
+    far = detector.detect(expose(render([Card((80, 20), 20)]), 2, rng()))
     assert far.track[0] not in numbers[0]
 
 
 def test_a_masked_roundel_is_discarded():
-    image = expose(render([Disc((40, 60), 20), Disc((120, 60), 20)]), 2, rng())
+    image = expose(render([Card((40, 60), 20), Card((120, 60), 20)]), 2, rng())
     found = Detector(mask=[[(0, 0), (80, 0), (80, 119), (0, 119)]]).detect(image)
     assert found.uv[:, 0] == pytest.approx([120], abs=0.1)
 
 
 def test_the_result_does_not_depend_on_the_memory_layout():
-    image = expose(render([Disc((80, 60), 20, 0.4)]), 2, rng())
+    image = expose(render([Card((80, 60), 20, 0.4)]), 2, rng())
     wide = np.zeros((240, 400), np.uint8)
     wide[::2, 100:260] = image
     views = (wide[::2, 100:260], np.asfortranarray(image))
@@ -222,7 +221,7 @@ def test_an_image_that_is_not_grey_is_refused():
 def test_theta_of_the_papers_detector():
     """Section III-B: theta = (m_d + m_b) / 2 after one frame, within a level; it steps while nothing is found."""
     detector = Detector(detector="paper")
-    detector.detect(expose(render([Disc((80, 60), 40)]), 1, rng()))
+    detector.detect(expose(render([Card((80, 60), 40)]), 1, rng()))
     assert detector.threshold == pytest.approx((40 + 190) / 2, abs=1)
     flat = np.full((120, 160), 90, np.uint8)
     steps = []
@@ -236,24 +235,24 @@ def test_theta_of_the_papers_detector():
 
 def test_only_the_papers_detector_has_a_threshold():
     detector = Detector()
-    detector.detect(expose(render([Disc((80, 60), 40)]), 1, rng()))
+    detector.detect(expose(render([Card((80, 60), 40)]), 1, rng()))
     assert detector.threshold is None
 
 
 def test_distance_by_the_principal_axis():
     """Section III-C: at any tilt the major axis in the normalized plane gives the distance; exact for frontal discs."""
     for tilt in np.radians([0, 30, 60]):
-        disc = Disc((79.5, 59.5), 30, tilt)
-        major = outer_conic(disc, PRINCIPAL)[1][0] / disc.f
-        distance = _core.distance_by_principal_axis(disc.diameter / disc.f, major)
-        assert distance == pytest.approx(1.0, abs=(disc.diameter / disc.f) ** 2)
+        disc = Card((79.5, 59.5), 30, tilt)
+        major = outline_of(disc)[1][0] / F
+        distance = _core.distance_by_principal_axis(disc.diameter / F, major)
+        assert distance == pytest.approx(1.0, abs=(disc.diameter / F) ** 2)
     with pytest.raises(ValueError, match="above 0"):
         _core.distance_by_principal_axis(0.1, 0.0)
 
 
 def test_a_known_roundel_may_be_partly_occluded():
     """A bar as bright as paper covers the outer fifth. A new ring of this shape is rejected as a letter."""
-    disc = Disc((80.3, 59.8), 36, 0.3, 0.4)
+    disc = Card((80.3, 59.8), 36, 0.3, 0.4)
     clean = render([disc], blur=0)
     covered = clean.copy()
     covered[:, 94:101] = 190

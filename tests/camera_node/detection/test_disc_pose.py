@@ -15,8 +15,8 @@ from camera_node.detection.disc_pose import (
 from camera_node.detection.roundels import Roundel, Roundels
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import ellipses_of
-from tests.camera_node.rendering import Disc, expose, outer_conic, render
-from tests.camera_node.tracing import Sight, pixels_across, trace
+from tests.benchmarks.detector.pictures import Card, outline_of, render, sight_of
+from tests.camera_node.tracing import Sight, expose, pixels_across, trace
 
 SMALL = Lens(width=160, height=120, fx=600, fy=600, cx=79.5, cy=59.5)
 RADIUS = 0.05
@@ -62,12 +62,12 @@ def test_one_of_the_two_is_the_true_pose(lens: Lens, tolerance_m: float, tilt: f
 def test_a_measured_offset_determines_the_normal():
     """At 60 px and 40 degrees the centres of the two poses are 2 px apart: many standard deviations."""
     for turn in (0.4, 2.0, 5.0):
-        disc = Disc((82, 61), 60, np.radians(40), turn)
+        disc = Card((82, 61), 60, np.radians(40), turn)
         (found,) = Detector().detect(expose(render([disc]), 2, np.random.default_rng(3)))
         poses = locate(found, SMALL, 0.1)
         assert poses is not None
         assert poses[0].probability > 0.99
-        assert poses[0].normal @ disc.normal > np.cos(np.radians(2))
+        assert poses[0].normal @ sight_of(disc, (160, 120)).normal > np.cos(np.radians(2))
         assert poses[0].position_m[2] == pytest.approx(0.1 / (60 / 600), rel=0.005)
 
 
@@ -171,7 +171,7 @@ def test_an_ellipse_outside_of_the_field_of_view_has_no_pose():
 
 def test_the_renderers_ellipse():
     """A frontal disc on the axis is a circle of its diameter."""
-    centre, axes = outer_conic(Disc((79.5, 59.5), 30), np.array([79.5, 59.5]))
+    centre, axes = outline_of(Card((79.5, 59.5), 30))
     assert centre == pytest.approx([79.5, 59.5])
     assert axes == pytest.approx([30, 30])
 
@@ -184,7 +184,7 @@ def measured(position: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def measured_covariance(diameter: float) -> np.ndarray:
     """(1, 7, 7) covariance of a detected roundel, in the plane at distance one."""
-    image = expose(render([Disc((80.3, 60.6), diameter, 0.6, 1.0)]), 3, np.random.default_rng(1))
+    image = expose(render([Card((80.3, 60.6), diameter, 0.6, 1.0)]), 3, np.random.default_rng(1))
     (found,) = Detector().detect(image)
     ellipse = np.array([[*found.uv, *found.axes_px, found.angle_rad]])
     assert found.pose_cov is not None
@@ -217,7 +217,7 @@ def test_the_residual_is_chi_square_distributed():
 
 def test_the_lens_improves_the_image_of_the_discs_centre():
     """Without it only the hole's position in the disc determines it. At 30 px the error is more than halved."""
-    rng, disc, errors = np.random.default_rng(2), Disc((80.3, 60.6), 30, 0.6, 1.0), []
+    rng, disc, errors = np.random.default_rng(2), Card((80.3, 60.6), 30, 0.6, 1.0), []
     clean = render([disc])
     for _ in range(40):
         (found,) = Detector().detect(expose(clean, 3, rng))

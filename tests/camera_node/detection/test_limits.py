@@ -14,10 +14,10 @@ from tests.benchmarks.detector.accuracy import Errors, measure_cell
 from tests.benchmarks.detector.bound import bound
 from tests.benchmarks.detector.cells import Cell
 from tests.benchmarks.detector.negatives import clutter
+from tests.benchmarks.detector.pictures import Card, outline_of, render
 from tests.benchmarks.detector.recall import faint, of_size, recall
 from tests.benchmarks.detector.table import Run
-from tests.camera_node.rendering import Disc, expose, outer_conic, render
-from tests.camera_node.tracing import Sight, pixels_across
+from tests.camera_node.tracing import Sight, expose, pixels_across
 
 RUN = Run("chords", Detector, False)
 VIEWS, DRAWS = 4, 40
@@ -84,7 +84,7 @@ def test_nothing_is_found_in_clutter():
 
 
 @st.composite
-def scenes(draw: st.DrawFn) -> tuple[list[Disc], float, float, int]:
+def scenes(draw: st.DrawFn) -> tuple[list[Card], float, float, int]:
     """One to four separate roundels, their bright level, the blur and a seed for the noise."""
     places = draw(
         st.lists(
@@ -94,7 +94,7 @@ def scenes(draw: st.DrawFn) -> tuple[list[Disc], float, float, int]:
         )
     )
     discs = [
-        Disc(
+        Card(
             (u + draw(st.floats(-3, 3)), v + draw(st.floats(-3, 3))),
             draw(st.floats(16, 34)),
             draw(st.floats(0, 0.7)),
@@ -107,15 +107,15 @@ def scenes(draw: st.DrawFn) -> tuple[list[Disc], float, float, int]:
 
 
 LEAST_ALIKE = [
-    Disc(uv=(118.25, 27.234375), diameter=19.765625, tilt=0.5625, turn=6.0),
-    *(Disc(uv=uv, diameter=16.0) for uv in ((40.0, 30.0), (40.0, 90.0), (120.0, 90.0))),
+    Card(uv=(118.25, 27.234375), diameter=19.765625, tilt=0.5625, turn=6.0),
+    *(Card(uv=uv, diameter=16.0) for uv in ((40.0, 30.0), (40.0, 90.0), (120.0, 90.0))),
 ]
 
 
 @settings(max_examples=15)
 @given(scenes())
 @example((LEAST_ALIKE, 133.0, 0.75, 1))
-def test_both_detectors_agree(scene: tuple[list[Disc], float, float, int]):
+def test_both_detectors_agree(scene: tuple[list[Card], float, float, int]):
     """Both find every roundel; their fits have different initial guesses and the same result.
 
     A one-step estimate does not depend on its initial guess to first order: their difference is below one sigma of the
@@ -127,7 +127,7 @@ def test_both_detectors_agree(scene: tuple[list[Disc], float, float, int]):
     by_paper, by_chords = (Detector(detector=name).detect(image) for name in ("paper", "chords"))
     assert len(by_paper) == len(by_chords) == len(discs)
     for disc in discs:
-        centre = outer_conic(disc, np.array([79.5, 59.5]))[0]
+        centre = outline_of(disc)[0]
         ours, theirs = (r[int(np.linalg.norm(r.uv - centre, axis=1).argmin())] for r in (by_chords, by_paper))
         sigma, other = (float(np.sqrt(np.trace(found.cov) / 2)) for found in (ours, theirs))
         assert np.abs(ours.uv - theirs.uv).max() < max(sigma, other)

@@ -10,11 +10,10 @@ import pytest
 from camera_node.detection.detector import Detector
 from camera_node.simulation.sensor import CLEAN
 from tests.benchmarks.detector.cameras import moving
-from tests.benchmarks.detector.pictures import missed
-from tests.camera_node.rendering import Disc, expose, outer_conic, render
+from tests.benchmarks.detector.pictures import Card, missed, outline_of, render
+from tests.camera_node.tracing import expose
 
 SIZE = (72, 88)
-PRINCIPAL = np.array([(SIZE[1] - 1) / 2, (SIZE[0] - 1) / 2])
 DIAMETER = 32.0
 START = (34.0, 38.0)
 AT = (45.3, 34.8)  # in mid-exposure
@@ -26,7 +25,7 @@ def exposed(length: float, turn: float, tilt: float, ground: float) -> np.ndarra
     n = int(np.ceil(length / PART))
     times = ((np.arange(n) + 0.5) / n - 0.5) * length
     places = [(AT[0] + t * np.cos(turn), AT[1] + t * np.sin(turn)) for t in times]
-    discs = [Disc(at, DIAMETER, tilt, turn=1.0) for at in places]
+    discs = [Card(at, DIAMETER, tilt, turn=1.0) for at in places]
     return np.mean([render([disc], SIZE, ground=ground, blur=0.7) for disc in discs], axis=0)
 
 
@@ -40,9 +39,9 @@ def test_moving_roundels_are_tracked_with_a_consistent_covariance(length: float)
     rng, squared = np.random.default_rng(11), []
     for k, turn in enumerate(np.pi * np.arange(6) / 6):
         tilt, ground = (0.0, 0.3, 0.6)[k % 3], (190.0, 90.0)[k % 2]
-        sharp = render([Disc(START, DIAMETER, tilt, turn=1.0)], SIZE, ground=ground)
+        sharp = render([Card(START, DIAMETER, tilt, turn=1.0)], SIZE, ground=ground)
         clean = exposed(length, turn, tilt, ground)
-        centre = outer_conic(Disc(AT, DIAMETER, tilt, turn=1.0), PRINCIPAL)[0]
+        centre = outline_of(Card(AT, DIAMETER, tilt, turn=1.0), SIZE)[0]
         for _ in range(16):
             detector = Detector()
             (before,) = detector.detect(expose(sharp, 3, rng))
@@ -60,7 +59,7 @@ def test_moving_roundels_are_found_on_the_first_frame_with_a_consistent_covarian
     for k, turn in enumerate(np.pi * np.arange(12) / 12):
         tilt, ground = (0.0, 0.3, 0.6)[k % 3], (190.0, 90.0)[k % 2]
         clean = exposed(length, turn, tilt, ground)
-        centre = outer_conic(Disc(AT, DIAMETER, tilt, turn=1.0), PRINCIPAL)[0]
+        centre = outline_of(Card(AT, DIAMETER, tilt, turn=1.0), SIZE)[0]
         for _ in range(8):
             n_frames += 1
             for found in Detector().detect(expose(clean, 3, rng)):
@@ -95,16 +94,14 @@ def test_short_motions_are_found_on_clutter_on_the_first_frame():
 def test_size_and_contrast_are_those_of_a_sharp_image():
     """Axes within 1 %, contrast within 3 %, although a motion of 20 px spreads a ring of 6 px over thrice its area."""
     detector, rng = Detector(), np.random.default_rng(4)
-    detector.detect(expose(render([Disc(START, DIAMETER, 0.4, turn=1.0)], SIZE), 2, rng))
+    detector.detect(expose(render([Card(START, DIAMETER, 0.4, turn=1.0)], SIZE), 2, rng))
     (found,) = detector.detect(expose(exposed(20.0, 0.7, 0.4, 90.0), 2, rng))
-    assert found.axes_px == pytest.approx(
-        outer_conic(Disc(AT, DIAMETER, 0.4, turn=1.0), PRINCIPAL)[1], rel=0.01
-    )
+    assert found.axes_px == pytest.approx(outline_of(Card(AT, DIAMETER, 0.4, turn=1.0), SIZE)[1], rel=0.01)
     assert found.contrast == pytest.approx(150, rel=0.03)
 
 
 @pytest.mark.parametrize("ground", [60.0, 190.0])
 def test_a_roundel_that_disappears_is_not_found_in_noise(ground: float):
     detector, rng = Detector(), np.random.default_rng(5)
-    assert len(detector.detect(expose(render([Disc(START, DIAMETER)], SIZE, ground=ground), 3, rng))) == 1
+    assert len(detector.detect(expose(render([Card(START, DIAMETER)], SIZE, ground=ground), 3, rng))) == 1
     assert len(detector.detect(expose(np.full(SIZE, ground), 3, rng))) == 0

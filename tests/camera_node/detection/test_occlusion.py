@@ -14,12 +14,11 @@ from camera_node.detection.roundels import Roundel
 from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.motion import appear_after_disappearance
 from tests.benchmarks.detector.negatives import COMMON, letters, print_letters, rings, text_pages
-from tests.benchmarks.detector.pictures import Card, Grey, flat, grid, paste
+from tests.benchmarks.detector.pictures import Card, Grey, flat, grid, outline_of, paste, render
 from tests.benchmarks.detector.recall import occluded, recall
 from tests.benchmarks.detector.table import Run
-from tests.camera_node.rendering import Disc, expose, outer_conic, render
+from tests.camera_node.tracing import expose
 
-PRINCIPAL = np.array([79.5, 59.5])
 SHARES = np.arange(-0.1, 0.45, 0.05)  # of the diameter that is occluded, from the rim
 NOISE = 2.5
 MODEL_PX = 0.02  # allowed model error, if an occluding object of nearly the paper's level touches the rim
@@ -41,19 +40,19 @@ class Step:
         return float(self.error @ np.linalg.solve(self.cov + MODEL_PX**2 * np.eye(2), self.error))
 
 
-def occlude(clean: Array, disc: Disc, share: float, turn: float, level: float) -> Array:
+def occlude(clean: Array, disc: Card, share: float, turn: float, level: float) -> Array:
     """Set the image beyond a straight edge to `level`; `share` of the diameter lies beyond the edge."""
     v, u = np.mgrid[: clean.shape[0], : clean.shape[1]]
-    centre, _ = outer_conic(disc, PRINCIPAL)
+    centre, _ = outline_of(disc)
     along = (u - centre[0]) * np.cos(turn) + (v - centre[1]) * np.sin(turn)
     part = np.clip(0.5 + along - (0.5 - share) * disc.diameter, 0, 1)
     return cv2.GaussianBlur(clean + part * (level - clean), (0, 0), 0.7)
 
 
-def occlude_slowly(disc: Disc, turn: float, level: float, rng: np.random.Generator) -> list[Step]:
+def occlude_slowly(disc: Card, turn: float, level: float, rng: np.random.Generator) -> list[Step]:
     """The detections of a tracked roundel while an object occludes more and more of it."""
     detector, clean, steps = Detector(), render([disc], blur=0), []
-    centre, _ = outer_conic(disc, PRINCIPAL)
+    centre, _ = outline_of(disc)
     detector.detect(expose(occlude(clean, disc, -1, turn, level), NOISE, rng))
     for share in SHARES.tolist():
         found = detector.detect(expose(occlude(clean, disc, share, turn, level), NOISE, rng))
@@ -69,7 +68,7 @@ def steps() -> list[Step]:
     for _ in range(40):
         u, v = rng.uniform(-1, 1, 2)
         tilt, turn, side = rng.uniform(0, (0.9, 6.3, 6.3))
-        disc = Disc((80 + u, 60 + v), float(rng.uniform(14, 40)), float(tilt), float(turn))
+        disc = Card((80 + u, 60 + v), float(rng.uniform(14, 40)), float(tilt), float(turn))
         steps += occlude_slowly(disc, float(side), float(rng.uniform(0, 255)), rng)
     return steps
 

@@ -11,8 +11,7 @@ from camera_node.detection.relative_positions import MAX_LOCATED, DiscLocalizer
 from camera_node.detection.roundels import DetectedRoundels, LocatedRoundels
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
-from tests.camera_node.rendering import expose
-from tests.camera_node.tracing import Sight, pixels_across, trace
+from tests.camera_node.tracing import Sight, expose, pixels_across, trace
 
 DIAMETER_M = 0.1
 LENS = Lens(width=60, height=60, fx=600, fy=600, cx=150, cy=-60)

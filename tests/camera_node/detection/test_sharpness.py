@@ -11,7 +11,8 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import Roundels
 from camera_node.detection.sharpness import SECTORS, SIGMAS, edge_blur_px
 from camera_node.node.node_status import BLURRED_PX, advise_focus
-from tests.camera_node.rendering import Disc, expose, render
+from tests.benchmarks.detector.pictures import Card, render
+from tests.camera_node.tracing import expose
 
 STEP = SIGMAS[1] / SIGMAS[0]  # between two blurs that are tried
 PIXEL_VARIANCE = 1 / 12  # square pixels, of the blur by a pixel's area
@@ -27,7 +28,7 @@ def test_the_blur_is_measured(diameter: float, tilt: float):
     """To one step of the blurs that are tried, and 15 % for the variance of the interpolation; it grows with it."""
     measured = []
     for blur in (0.5, 0.8, 1.2):
-        disc = Disc((80.3, 60.1), diameter, tilt=tilt, turn=0.5)
+        disc = Card((80.3, 60.1), diameter, tilt=tilt, turn=0.5)
         found = measure(expose(render([disc], blur=blur), 2.0, np.random.default_rng(1)))
         assert found is not None
         assert found == pytest.approx(math.hypot(blur, PIXEL_VARIANCE**0.5), rel=STEP - 1 + 0.15)
@@ -40,7 +41,7 @@ def test_motion_is_no_defocus():
 
     A sector of directions begins at most its own width off the direction across the motion.
     """
-    still = render([Disc((80.3, 60.1), 50)], blur=0.7)
+    still = render([Card((80.3, 60.1), 50)], blur=0.7)
     moving = cv2.filter2D(still, -1, np.full((1, 7), 1 / 7))
     roundels = Detector().detect(expose(still, 2.0, np.random.default_rng(1)))
     rest, motion = (edge_blur_px(expose(i, 2.0, np.random.default_rng(2)), roundels) for i in (still, moving))
@@ -55,7 +56,7 @@ def test_motion_is_no_defocus():
 
 def test_nothing_is_measured_without_roundels():
     assert measure(np.full((60, 80), 90, np.uint8)) is None
-    assert measure(expose(render([Disc((80, 60), 10)]), 2.0, np.random.default_rng(1))) is None
+    assert measure(expose(render([Card((80, 60), 10)]), 2.0, np.random.default_rng(1))) is None
     assert edge_blur_px(np.empty((0, 0), np.uint8), Roundels.from_points(np.zeros((1, 2)), 0.1)) is None
 
 

@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from camera_node.detection.detector import Detector
 from camera_node.foundation.errors import ConfigError
-from tests.camera_node.rendering import Disc, expose, render
+from tests.benchmarks.detector.pictures import Card, render
+from tests.camera_node.tracing import expose
 
 
-def frame(*discs: Disc, seed: int = 1) -> NDArray[np.uint8]:
+def frame(*discs: Card, seed: int = 1) -> NDArray[np.uint8]:
     return expose(render(list(discs), bright=200), 2, np.random.default_rng(seed))
 
 
@@ -20,14 +21,14 @@ def test_a_search_share_finds_every_new_roundel(share: float, begin: int):
     """At any position and any time of the cycle, a new roundel is found within 1 / share frames."""
     plain, rounds = frame(), round(1 / share)
     for v in (16.0, 40.0, 60.0, 80.0, 104.0):
-        detector, shown = Detector(search_share=share), frame(Disc((80, v), 24))
+        detector, shown = Detector(search_share=share), frame(Card((80, v), 24))
         for _ in range(rounds + begin):
             detector.detect(plain)
         assert any(len(detector.detect(shown)) for _ in range(rounds))
 
 
 def test_tracked_roundels_are_found_in_every_frame():
-    detector, discs = Detector(search_share=0.1), [Disc((40, 20), 20), Disc((120, 100), 20)]
+    detector, discs = Detector(search_share=0.1), [Card((40, 20), 20), Card((120, 100), 20)]
     shown = frame(*discs)
     while len(detector.detect(shown)) < 2:
         pass
@@ -37,7 +38,7 @@ def test_tracked_roundels_are_found_in_every_frame():
 @pytest.fixture(scope="module")
 def crowd() -> NDArray[np.uint8]:
     """2,700 roundels of 12 px, 20 px apart."""
-    tile = render([Disc((9.5, 9.5), 12)], (20, 20), bright=210, ground=210, blur=0.6)
+    tile = render([Card((9.5, 9.5), 12)], (20, 20), bright=210, ground=210, blur=0.6)
     return expose(np.tile(tile, (45, 60)), 1, np.random.default_rng(1))
 
 
@@ -55,12 +56,12 @@ def test_the_fits_of_a_frame_are_limited_and_all_seeds_are_fitted(crowd: NDArray
 
 def test_postponed_seeds_are_counted(crowd: NDArray[np.uint8]):
     detector = Detector()
-    assert detector.detect(frame(Disc((80, 60), 24))).n_postponed == 0
+    assert detector.detect(frame(Card((80, 60), 24))).n_postponed == 0
     assert detector.detect(crowd).n_postponed > 1000
 
 
 def test_new_settings_preserve_the_tracks():
-    discs = [Disc((40, 60), 20), Disc((120, 60), 30)]
+    discs = [Card((40, 60), 20), Card((120, 60), 30)]
     detector = Detector()
     before = detector.detect(frame(*discs))
     changed = detector.adjusted(min_contrast=40.0)
@@ -69,7 +70,7 @@ def test_new_settings_preserve_the_tracks():
     assert dict(zip(before.track.tolist(), np.rint(before.uv[:, 0]), strict=True)) == dict(
         zip(after.track.tolist(), np.rint(after.uv[:, 0]), strict=True)
     )
-    new = changed.adjusted(max_diameter_px=25.0).detect(frame(*discs, Disc((80, 100), 20), seed=3))
+    new = changed.adjusted(max_diameter_px=25.0).detect(frame(*discs, Card((80, 100), 20), seed=3))
     assert set(new.track.tolist()) - set(before.track.tolist()) == {2}
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from camera_node import _core
-from tests.camera_node.rendering import Disc, expose, render
+from tests.benchmarks.detector.pictures import Card, render
+from tests.camera_node.tracing import expose
 from tests.conftest import ROOT
 from tests.native import build
 
@@ -28,10 +29,10 @@ def frames() -> list[np.ndarray]:
     rng, made = np.random.default_rng(9), []
     for diameter in (9, 12, 16, 21, 34, 60):
         for tilt in (0.0, 0.6, 1.05):
-            discs = [Disc((80.2, 60.7), diameter, tilt, tilt), Disc((4.0, 100.0), 20, 0.2)]
+            discs = [Card((80.2, 60.7), diameter, tilt, tilt), Card((4.0, 100.0), 20, 0.2)]
             clean = render(discs, bright=rng.choice([150, 190, 262]), ground=rng.choice([60, 120, 190]))
             made += [expose(clean, 3, rng) for _ in range(2)]
-    moving = np.mean([render([Disc((60.2 + t, 50.7), 32)]) for t in range(-10, 11)], axis=0)
+    moving = np.mean([render([Card((60.2 + t, 50.7), 32)]) for t in range(-10, 11)], axis=0)
     return [*made, *(expose(moving, 3, rng) for _ in range(2))]
 
 

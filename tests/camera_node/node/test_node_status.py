@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from camera_node.node.node_status import FULL, advise
-from tests.camera_node.rendering import Disc, expose, render
+from tests.benchmarks.detector.pictures import Card, render
+from tests.camera_node.tracing import expose
 
 NONE = np.empty((0, 2))
 CENTRE = np.array([[80.0, 60.0]])
@@ -23,7 +24,7 @@ CENTRE = np.array([[80.0, 60.0]])
 )
 def test_advice_depends_on_the_white_of_the_roundels(bright: float, kind: str, change: str):
     """For any background: here a dark one for bright paper and the reverse."""
-    roundel = render([Disc((80, 60), 40)], dark=bright / 8, bright=bright, ground=255.0 - bright)
+    roundel = render([Card((80, 60), 40)], dark=bright / 8, bright=bright, ground=255.0 - bright)
     advice = advise(expose(roundel, 0, np.random.default_rng(1)), CENTRE)
     assert advice.partition(":")[0] == kind
     assert change in advice

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from camera_node.detection.detector import Detector
 from camera_node.sources.grey import BAYER, narrow, to_grey
 from camera_node.sources.recorded_frames import FrameFolder
-from tests.camera_node.rendering import Disc, outer_conic, render
+from tests.benchmarks.detector.pictures import Card, outline_of, render
 
 LEVELS = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10
-PRINCIPAL = np.array([79.5, 59.5])
 
 
 def yuyv(image: NDArray) -> NDArray:
@@ -85,17 +84,17 @@ FORMATS: dict[str, tuple[Callable[[NDArray], NDArray], str | None]] = {
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_roundel_is_detected_at_its_place_in_every_format(name: str):
     """Without noise, the error is below 0.02 px from rounding, and twice that after demosaicing."""
-    disc = Disc((80.3, 59.8), 30, 0.5, 0.7)
+    disc = Card((80.3, 59.8), 30, 0.5, 0.7)
     scene = render([disc], bright=230.0)
     scene[:2] = 255  # so that the brightest pixel determines the depth of 10 to 16 bits
     encode, fourcc = FORMATS[name]
     (found,) = Detector().detect(to_grey(encode(scene), fourcc))
-    centre = outer_conic(disc, PRINCIPAL)[0]
+    centre = outline_of(disc)[0]
     assert np.abs(found.uv - centre).max() < (0.04 if fourcc in BAYER else 0.02)
 
 
 def test_the_detector_refuses_images_that_are_not_converted():
-    deep = (16 * render([Disc((80.3, 59.8), 30, 0.5, 0.7)])).astype(np.uint16)
+    deep = (16 * render([Card((80.3, 59.8), 30, 0.5, 0.7)])).astype(np.uint16)
     with pytest.raises(ValueError, match="uint16"):
         Detector().detect(deep)  # pyright: ignore[reportArgumentType] the wrong type on purpose
 
