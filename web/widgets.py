@@ -25,6 +25,7 @@ Result = TypeVar("Result")
 # would leave a browser with the value that the page no longer has, and that it therefore never sends again.
 _setting = threading.RLock()
 acting_browser: ContextVar[viser.ClientHandle | None] = ContextVar("acting_browser", default=None)
+CLOSE_S = 5.0  # for an action to save what it has when the page closes
 REACTION_S = 1.0  # in which an operator cannot have seen that another one clicked first
 
 
@@ -261,13 +262,13 @@ class LongAction:
         if not self.is_running:
             set_property(self.handle, "disabled", not enabled)
 
-    def close(self, timeout_s: float) -> None:
+    def close(self) -> None:
         """End the action and wait for it."""
         with self._lock:
             self._closed = True
             self._end.set()
         if self._thread is not None:
-            self._thread.join(timeout_s)
+            self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
         try:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.commands.output import conclude, put_in_force
-from calib.rig.file_history import History, HistoryStep
-from calib.rig.rig import Rig, load_rig
+from calib.rig.file_history import History, Step
+from calib.rig.rig import load_rig
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
@@ -30,13 +30,16 @@ class RestoreOptions:
             raise ConfigError(f"{self.rig} does not exist; check --rig")
         return History(self.rig)
 
-    def conclude(self, rig: Rig, step: HistoryStep, program: str) -> None:
-        """Print what was restored, and hand it to the server."""
+    def take(self, direction: Step) -> None:
+        """Swap the files, print what was restored, and hand it to the server."""
+        history = self.history()
+        rig = load_rig(history.neighbour(direction))  # a broken one is not restored
+        step = history.take(direction)
         date = rig.calibration.get("date")
         made = f"made at {date}" if date else "no date recorded"
         replaced = f"; the rig that it replaces is saved as {step.replaced.name}" if step.replaced else ""
         say(f"restored {self.rig} from {step.restored.name} ({made}){replaced}")
-        conclude(self.connection, rig, self.rig, program, live=self.live)
+        conclude(self.connection, rig, self.rig, f"roundel calibrate {direction}", live=self.live)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +47,8 @@ class Undo(RestoreOptions):
     """Restore the rig from before the last calibration; roundel calibrate redo reverts that."""
 
     def run(self) -> None:
-        """Swap the files, and hand the restored rig to the server."""
-        history = self.history()
-        rig = load_rig(history.previous())  # a broken one is not restored
-        self.conclude(rig, history.undo(), "roundel calibrate undo")
+        """See `RestoreOptions.take`."""
+        self.take("undo")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,10 +56,8 @@ class Redo(RestoreOptions):
     """Restore the rig that was undone last."""
 
     def run(self) -> None:
-        """Swap the files, and hand the restored rig to the server."""
-        history = self.history()
-        rig = load_rig(history.next())
-        self.conclude(rig, history.redo(), "roundel calibrate redo")
+        """See `RestoreOptions.take`."""
+        self.take("redo")
 
 
 @dataclass(frozen=True, kw_only=True)

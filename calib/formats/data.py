@@ -172,13 +172,13 @@ def read_text(path: Path) -> str:
         raise ConfigError(f"{path} is not a text file; check the path and --format") from None
 
 
-def read_numbers(path: Path, separators: str = ",;\t") -> list[list[float]]:
+def read_numbers(path: Path) -> list[list[float]]:
     """The rows of numbers of a text file; `nan` is a number, lines that start with # or % are comments.
 
     Raises:
         ConfigError: the file can't be read, or a line has something else than numbers.
     """
-    rows, table = [], str.maketrans(dict.fromkeys(separators, " "))
+    rows, table = [], str.maketrans(",;\t", "   ")
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.translate(table).split()
         if not words or words[0].startswith(("#", "%")):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import ConfigError
+from camera_node.printing.sheets import MARKER_RATIO
 
 Corners = tuple[NDArray[np.float32], NDArray[np.float32]]
 
@@ -20,7 +21,7 @@ WINDOW, MIN_WINDOW_PX = (
     2,
 )  # half of the window of a corner's refinement, of the distance to the next corner
 REFINED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
-MARKER_RATIO, DICTIONARY = 0.75, "DICT_4X4_1000"  # unless given
+DICTIONARY = "DICT_4X4_1000"  # unless given
 FORM = (
     "charuco:COLSxROWS:SQUARE_M[:MARKER_RATIO[:DICTIONARY]] in squares, such as charuco:5x4:0.054:0.75:DICT_4X4_50, "
     "or chessboard:COLSxROWS:SQUARE_M in inner corners, such as chessboard:9x6:0.025"

@@ -12,13 +12,13 @@ import zenoh
 from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import CameraError
 from camera_node.protocol.messages import Keys
+from camera_node.protocol.requests import RETRY_S
 from camera_node.sources.grey import to_grey
 from camera_node.sources.recorded_frames import IMAGES, VIDEOS, read_grey
 
 MAX_FRAMES = 600  # read from a video, evenly spaced: a lens needs 60 good ones
 REPLY_S = 2.0  # for a camera to answer a request
 SILENT_S = 5.0  # without any answer: the camera counts as missing
-RETRY_S = 0.1  # between two requests without an answer
 JPEG_QUALITY = 95  # that is requested: artefacts move corners
 
 NamedImage = tuple[str, Grey]

@@ -284,12 +284,12 @@ def is_from_behind(view: BoardView) -> bool:
     return float(np.linalg.det(M[:2])) < 0
 
 
-def choose_views(views: Sequence[BoardView], size: tuple[int, int], most: int = MAX_VIEWS) -> list[BoardView]:
-    """Select up to `most` views that fill the image evenly."""
-    if len(views) <= most:
+def choose_views(views: Sequence[BoardView], size: tuple[int, int]) -> list[BoardView]:
+    """Select up to `MAX_VIEWS` views that fill the image evenly."""
+    if len(views) <= MAX_VIEWS:
         return list(views)
     counts = np.array([Coverage.of(view.area, *size).counts.ravel() for view in views], float)
-    return [view for view, chosen in zip(views, choose_covering(counts, most), strict=True) if chosen]
+    return [view for view, chosen in zip(views, choose_covering(counts, MAX_VIEWS), strict=True) if chosen]
 
 
 def _start(views: Sequence[BoardView], size: tuple[int, int], model: Model) -> tuple[Lens, list[BoardView]]:

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.coverage import CELLS
+from calib.rig.precision_map import PAPER
+from camera_node.detection.overlay import SHIFT
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 
@@ -13,8 +15,7 @@ WIDTH = 1200  # pixels of the plot
 TITLE = 34  # pixels above it
 ARROW = 18  # pixels, the length of the 90 % quantile of the residuals
 MIN_POINTS = 4  # in a cell with a mean residual
-SHIFT = 4  # OpenCV draws in 1/16 pixels
-PAPER, INK, MEAN, SHADE = (252, 252, 250), (60, 50, 40), (200, 90, 20), (205, 225, 250)
+INK, MEAN, SHADE = (60, 50, 40), (200, 90, 20), (205, 225, 250)
 
 
 def draw_residuals(

@@ -161,10 +161,8 @@ def collect_with_progress(
         return collect_frames(session, arena, seconds, show)[0]
 
 
-def running_camera_sizes(
-    session: zenoh.Session, arena: str, seconds: float = LISTEN_S
-) -> dict[str, tuple[int, int]]:
-    """Width and height, pixels, of all cameras that publish their status within that time."""
+def running_camera_sizes(session: zenoh.Session, arena: str) -> dict[str, tuple[int, int]]:
+    """Width and height, pixels, of all cameras that publish their status within `LISTEN_S`."""
     sizes: dict[str, tuple[int, int]] = {}
     key = Keys(arena).camera_status()
 
@@ -177,6 +175,6 @@ def running_camera_sizes(
             sizes[status.camera] = status.width, status.height
 
     subscriber = session.declare_subscriber(key, guarded(key, receive))
-    threading.Event().wait(seconds)
+    threading.Event().wait(LISTEN_S)
     subscriber.undeclare()
     return dict(sizes)

@@ -5,16 +5,16 @@ import time
 
 import zenoh
 
+from calib.rig.file_history import Step
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import (
     RigHistory,
     RigMessage,
     RigRequest,
     RigStepRequest,
-    redo_rig_key,
     rig_history_key,
+    rig_step_key,
     set_rig_key,
-    undo_rig_key,
 )
 from camera_node.foundation.errors import NetworkError
 from camera_node.protocol.messages import Keys, MessageError, decode, encode
@@ -52,58 +52,37 @@ def set_rig(
     return _read(send_request(session, set_rig_key(arena), encode(request), timeout_s))
 
 
-def undo_rig(
+def step_rig(
     session: zenoh.Session,
     arena: str,
+    step: Step,
     program: str,
     timeout_s: float = REQUEST_S,
     rig_t_ns: int | None = None,
 ) -> RigMessage:
-    """Have the server undo the last change of its rig; returns and raises as `set_rig`.
-
-    `rig_t_ns` as in `RigStepRequest`.
-    """
-    return _request_step(session, undo_rig_key(arena), program, timeout_s, rig_t_ns)
-
-
-def redo_rig(
-    session: zenoh.Session,
-    arena: str,
-    program: str,
-    timeout_s: float = REQUEST_S,
-    rig_t_ns: int | None = None,
-) -> RigMessage:
-    """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`.
-
-    `rig_t_ns` as in `RigStepRequest`.
-    """
-    return _request_step(session, redo_rig_key(arena), program, timeout_s, rig_t_ns)
-
-
-def _request_step(
-    session: zenoh.Session, key: str, program: str, timeout_s: float, rig_t_ns: int | None
-) -> RigMessage:
+    """Have the server undo the last change of its rig, or redo the one that was undone last; returns and raises as
+    `set_rig`. `rig_t_ns` as in `RigStepRequest`."""
     request = RigStepRequest(source=RequestSource.of(program), rig_t_ns=rig_t_ns)
-    return _read(send_request(session, key, encode(request), timeout_s))
+    return _read(send_request(session, rig_step_key(arena, step), encode(request), timeout_s))
 
 
-def request_rig_history(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> RigHistory:
+def request_rig_history(session: zenoh.Session, arena: str) -> RigHistory:
     """All versions of the server's rig.
 
     Raises:
         RequestError: the server can't read them.
         NetworkError: no server answers in time, or with something else.
     """
-    data = send_request(session, rig_history_key(arena), timeout_s=timeout_s)
+    data = send_request(session, rig_history_key(arena))
     try:
         return decode(data, RigHistory)
     except MessageError as error:
         raise NetworkError(f"the server's reply is no history: {error}; {OTHER_VERSION}") from None
 
 
-def request_rig(session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S) -> Rig | None:
+def request_rig(session: zenoh.Session, arena: str) -> Rig | None:
     """The rig in force; returns None and raises as `request_rig_message`."""
-    data = request_rig_message(session, arena, timeout_s)
+    data = request_rig_message(session, arena)
     return None if data is None else _read(data).rig
 
 

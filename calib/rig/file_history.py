@@ -9,12 +9,14 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from calib.errors import CalibrationError
 from camera_node.foundation.config import new_path
 from camera_node.foundation.errors import ConfigError, describe_failed_write
 
 MAX_OLD = 20  # versions that are kept
+Step = Literal["undo", "redo"]
 
 
 @dataclass(frozen=True)
@@ -45,11 +47,11 @@ class History:
         return self._older.files()
 
     def undone(self) -> list[Path]:
-        """The undone versions; `redo` restores the last one."""
+        """The undone versions; a redo restores the last one."""
         return self._undone.files()
 
     def back_up(self) -> Path | None:
-        """Give the file a number, before it is replaced. Undone versions become older ones, which `undo` reaches.
+        """Give the file a number, before it is replaced. Undone versions become older ones, which an undo reaches.
 
         Returns:
             the numbered file; None if there is no file.
@@ -72,23 +74,13 @@ class History:
             if len(older) >= MAX_OLD and (minor := next(filter(is_minor, older), None)):
                 minor.unlink()
 
-    def previous(self) -> Path:
-        """The version that `undo` restores; raises CalibrationError if there is none."""
-        return self._newest(self._older, "earlier")
+    def neighbour(self, step: Step) -> Path:
+        """The version that a step restores: the previous one, or the one that was undone last.
 
-    def next(self) -> Path:
-        """The version that `redo` restores; raises CalibrationError if there is none."""
-        return self._newest(self._undone, "undone")
-
-    def undo(self) -> HistoryStep:
-        """Restore the previous version; raises CalibrationError if there is none."""
-        return self._restore(self.previous(), self._undone)
-
-    def redo(self) -> HistoryStep:
-        """Restore the version that was undone last; raises CalibrationError if there is none."""
-        return self._restore(self.next(), self._older)
-
-    def _newest(self, series: "_Series", word: str) -> Path:
+        Raises:
+            CalibrationError: there is none.
+        """
+        series, word = (self._older, "earlier") if step == "undo" else (self._undone, "undone")
         with self._reporting("restored"):
             files = series.files()
             while files and _are_equal(files[-1], self.path):  # a copy from a step that was interrupted
@@ -97,7 +89,9 @@ class History:
             raise CalibrationError(f"there is no {word} version of {self.path}; nothing was changed")
         return files[-1]
 
-    def _restore(self, version: Path, other: "_Series") -> HistoryStep:
+    def take(self, step: Step) -> HistoryStep:
+        """Restore the version of a step; raises as `neighbour`."""
+        version, other = self.neighbour(step), self._undone if step == "undo" else self._older
         with self._reporting("restored"):
             replaced = other.add(self.path) if self.path.exists() else None
             os.replace(version, self.path)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.rig.camera import Camera
-from calib.rig.triangulation import JointCovariance, Visibility, in_image, point_covariances
+from calib.rig.triangulation import JointCovariance, in_image, point_covariances
 from camera_node.foundation.arrays import Array, Index
 
 SIGMA_PX = 0.1  # of one coordinate of a roundel's centre, as the detector achieves on real images
@@ -116,7 +116,6 @@ def map_precision(
     grid: FloorGrid,
     sigma_px: float = SIGMA_PX,
     joint: JointCovariance | None = None,
-    sees: Visibility = in_image,
 ) -> PrecisionMap:
     """Predict the error of every grid point, from pixel noise and from the covariance of the cameras.
 
@@ -125,14 +124,13 @@ def map_precision(
         grid: the points, at the height of the robots' roundels.
         sigma_px: standard deviation of one coordinate of a roundel's centre, pixels.
         joint: covariance of all cameras together; by default independent poses and exact lenses.
-        sees: the visibility test, which returns (N,) whether a camera sees each point.
     """
     points = grid.points
-    covariance = point_covariances(cameras, points, sigma_px, joint, sees)
+    covariance = point_covariances(cameras, points, sigma_px, joint)
     known = np.isfinite(covariance).all(axis=(1, 2))
     sigma = np.full(len(covariance), np.inf)
     sigma[known] = 1e3 * np.sqrt(np.linalg.eigvalsh(covariance[known])[:, -1])
-    views = np.array([sees(camera, points) for camera in cameras]).astype(np.intp).sum(axis=0)
+    views = np.array([in_image(camera, points) for camera in cameras]).astype(np.intp).sum(axis=0)
     shape = (len(grid.y), len(grid.x))
     return PrecisionMap(grid, sigma_px, sigma.reshape(shape), views.reshape(shape))
 

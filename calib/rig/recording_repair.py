@@ -58,13 +58,12 @@ class _Content:
     counts: Counter[int] = field(default_factory=Counter)  # messages by channel
 
 
-def repair_recording(path: Path, max_size: int | None = None, limits: ReadLimits | None = None) -> Repair:
+def repair_recording(path: Path, max_size: int | None = None) -> Repair:
     """Complete a recording in place: mark its damaged parts, remove the unfinished chunk at its end, write the index.
 
     Args:
         path: an MCAP file with chunks, as `RecordingWriter` writes it.
         max_size: of the file in bytes, where the disk is full: the last chunks give way to the index.
-        limits: what a chunk and a message may state.
 
     Raises:
         ConfigError: the file is missing, is not an MCAP recording, exceeds the limits or can't be written.
@@ -72,7 +71,7 @@ def repair_recording(path: Path, max_size: int | None = None, limits: ReadLimits
     try:
         with path.open("rb+") as file:
             size = file.seek(0, 2)
-            reader = RecordingReader(file, limits or ReadLimits())
+            reader = RecordingReader(file, ReadLimits())
             content = _read_content(file, reader)
             if reader.n_too_large:
                 raise ConfigError(

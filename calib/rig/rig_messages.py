@@ -14,8 +14,10 @@ import msgspec
 import numpy as np
 
 from calib.rig.camera import Camera
+from calib.rig.file_history import Step
 from calib.rig.rig import Rig, dump_rig
 from camera_node.foundation.arrays import Array
+from camera_node.foundation.errors import printable
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import VERSION, MessageError
 from camera_node.protocol.requests import RequestSource
@@ -235,14 +237,18 @@ class RigHistory(msgspec.Struct, frozen=True, kw_only=True):
     rig_t_ns: int | None = None  # `t_ns` of the `RigMessage` in force; None without a rig
     versions: Annotated[tuple[RigVersion, ...], msgspec.Meta(max_length=MAX_VERSIONS)] = ()
 
-    def next_undo(self) -> RigVersion | None:
-        """The version whose change an undo reverts: the one in force, if there is an earlier one."""
-        states = [version.state for version in self.versions]
-        return self.versions[states.index("in force")] if {"earlier", "in force"} <= set(states) else None
+    def subject(self, step: Step) -> RigVersion | None:
+        """The version whose change an undo reverts, the one in force, or that a redo restores; None for none."""
+        by_state = {version.state: version for version in reversed(self.versions)}
+        if step == "redo":
+            return by_state.get("undone")
+        return by_state.get("in force") if "earlier" in by_state else None
 
-    def next_redo(self) -> RigVersion | None:
-        """The version that a redo puts in force again."""
-        return next((version for version in self.versions if version.state == "undone"), None)
+    def describe_step(self, step: Step) -> str:
+        """What a step has done that the server took, as a sentence for a terminal or the page."""
+        version = self.subject(step)
+        what = printable(version.describe()) if version else "the last change"
+        return f"{'undone' if step == 'undo' else 'redone'} on the server: {what}"
 
 
 def set_rig_key(arena: str) -> str:
@@ -253,14 +259,9 @@ def set_rig_key(arena: str) -> str:
     return f"{arena}/rig/set"
 
 
-def undo_rig_key(arena: str) -> str:
-    """The key of the queryable that takes a `RigStepRequest` and restores the rig before the last change."""
-    return f"{arena}/rig/undo"
-
-
-def redo_rig_key(arena: str) -> str:
-    """The key of the queryable that takes a `RigStepRequest` and restores the rig that was undone last."""
-    return f"{arena}/rig/redo"
+def rig_step_key(arena: str, step: Step) -> str:
+    """The key of the queryable that takes a `RigStepRequest`, and undoes the last change or redoes what was undone."""
+    return f"{arena}/rig/{step}"
 
 
 def rig_history_key(arena: str) -> str:

@@ -13,11 +13,10 @@ from camera_node.detection.roundels import DetectedRoundels, Roundels
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import VERSION, Keys, MessageError, decode
+from camera_node.protocol.requests import REQUEST_S
 from camera_node.protocol.session import guarded, is_from_router
 
 log = logging.getLogger("camera_node")
-
-ANSWER_S = 5.0  # for the server to answer with the rig
 
 
 class RigLens:
@@ -96,7 +95,7 @@ class RigLens:
             return
         every = zenoh.ConsolidationMode.NONE
         answer = guarded(f"reading {self._key}", self._answered)
-        self._session.get(self._key, answer, timeout=ANSWER_S, consolidation=every)
+        self._session.get(self._key, answer, timeout=REQUEST_S, consolidation=every)
 
     def _answered(self, reply: zenoh.Reply) -> None:
         """Use the reply: the server's in preference to that of another program."""

@@ -25,10 +25,8 @@ RULER_MM = 100
 FOOT_MM = 14.0  # at the lower edge, for the ruler
 ARC_RAD = 0.02  # of a code between two corners of its outline: 5 um from the circle for 180 mm
 CUT_MM = 4.0  # length of cut marks
-MARKER_RATIO, DICTIONARY = (
-    0.75,
-    cv2.aruco.DICT_4X4_1000,
-)  # of boards; the defaults of `roundel calibrate intrinsics --board`
+# Of boards; the defaults of `roundel calibrate intrinsics --board`.
+MARKER_RATIO, DICTIONARY = 0.75, cv2.aruco.DICT_4X4_1000
 
 
 @dataclass(frozen=True)

@@ -69,17 +69,15 @@ def request_snapshot(
     return _ask(session, arena, camera, key, b"", timeout_s)
 
 
-def next_detections(
-    session: zenoh.Session, arena: str, camera: str, timeout_s: float = REQUEST_S
-) -> Detections:
+def next_detections(session: zenoh.Session, arena: str, camera: str) -> Detections:
     """The detections of the next frame of a camera. Raises NetworkError if no valid ones arrive in time."""
     arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     key = Keys(arena).detections(camera)
     subscriber = session.declare_subscriber(key, lambda sample: arrived.put(sample.payload.to_bytes()))
     try:
-        return decode(arrived.get(timeout=timeout_s), Detections)
+        return decode(arrived.get(timeout=REQUEST_S), Detections)
     except (queue.Empty, MessageError) as error:
-        reason = str(error) or f"no frame within {timeout_s:g} s"
+        reason = str(error) or f"no frame within {REQUEST_S:g} s"
         raise NetworkError(f"camera {camera} sent no detections: {reason}; check its program") from None
     finally:
         subscriber.undeclare()
@@ -121,11 +119,9 @@ def _area(points: Array) -> float:
     return abs(float(u @ np.roll(v, -1) - v @ np.roll(u, -1))) / 2
 
 
-def request_cameras(
-    session: zenoh.Session, arena: str, timeout_s: float = REQUEST_S
-) -> dict[str, RegisteredCamera]:
+def request_cameras(session: zenoh.Session, arena: str) -> dict[str, RegisteredCamera]:
     """All registered cameras by name. Raises RequestError for an invalid answer, NetworkError for none."""
-    return _read_cameras(send_request(session, registered_key(arena), b"", timeout_s))
+    return _read_cameras(send_request(session, registered_key(arena)))
 
 
 def change_camera(

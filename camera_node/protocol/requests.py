@@ -26,7 +26,7 @@ QUALITY = 85  # JPEG quality unless the request gives one
 MAX_PAYLOAD = 1 << 20  # bytes
 REQUEST_S = 5.0  # for a program that answers to be found
 ANSWER_S = 60.0  # for an answer: to a new rig a server computes tables of its lenses
-RETRY_S = 0.1
+RETRY_S = 0.1  # between two requests without an answer
 MAX_SOURCE = 64  # characters of each part of a request's source
 Part = Annotated[str, msgspec.Meta(max_length=MAX_SOURCE)]
 T = TypeVar("T", bound=msgspec.Struct)

@@ -168,10 +168,10 @@ class FoundArena:
     endpoints: tuple[str, ...]
 
 
-def find_arenas(timeout_s: float = SCOUT_S) -> list[FoundArena]:
+def find_arenas() -> list[FoundArena]:
     """The arenas whose servers answer multicast scouting; other Zenoh routers are left out."""
     found = []
-    for endpoints in _scout(timeout_s):
+    for endpoints in _scout():
         try:
             with open_client(endpoints, timeout_s=CONNECT_S) as session:
                 replies = session.liveliness().get(ALIVE, timeout=CONNECT_S)
@@ -195,7 +195,7 @@ def choose_arena(found: Sequence[FoundArena], arena: str | None) -> FoundArena |
     return matching[0] if matching else None
 
 
-def _scout(timeout_s: float) -> list[tuple[str, ...]]:
+def _scout() -> list[tuple[str, ...]]:
     """The endpoints of each router that answers."""
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "true")
@@ -206,7 +206,7 @@ def _scout(timeout_s: float) -> list[tuple[str, ...]]:
             routers[str(hello.zid)] = tuple(hello.locators)
 
     scout = zenoh.scout(receive, what="router", config=config)
-    threading.Event().wait(timeout_s)
+    threading.Event().wait(SCOUT_S)
     scout.stop()
     return [endpoints for endpoints in routers.values() if endpoints]
 

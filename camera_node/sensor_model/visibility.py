@@ -146,17 +146,17 @@ def is_large_enough(
 
 
 def detection_range(
-    lens: Lens, pattern: Pattern, phi: float = 0.0, psi: float = 0.0, imaging: Imaging = DEFAULT_IMAGING
+    lens: Lens, pattern: Pattern, phi: float = 0.0, imaging: Imaging = DEFAULT_IMAGING
 ) -> tuple[float, float]:
     """v_min and v_max along the optical axis for our detector, metres; (nan, nan) where it finds none at any distance.
 
     Args:
         lens: the camera.
         pattern: the print.
-        phi, psi: rotations of the pattern about the image's vertical and horizontal axis, radians.
+        phi: rotation of the pattern about the image's vertical axis, radians.
         imaging: blur and contrast; the pattern does not move.
     """
-    normal = np.array([np.sin(phi), np.cos(phi) * np.sin(psi), -np.cos(phi) * np.cos(psi)])
+    normal = np.array([np.sin(phi), 0.0, -np.cos(phi)])
     # Steps of 3 % from an image of the disc that is ten images large to one of a hundredth of a pixel.
     first = pattern.d_o * min(lens.fx, lens.fy) / (10 * max(lens.width, lens.height))
     x = np.asarray(first * 1.03 ** np.arange(500), float)

@@ -18,11 +18,10 @@ from camera_node.geometry import codes
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert
 from camera_node.simulation.discs import Disc, RollingDisc, discs_while_read, place_discs
-from camera_node.simulation.floor import Picture, paint_floor, plain_floor, view_floor
+from camera_node.simulation.floor import SUBSAMPLES, Picture, paint_floor, plain_floor, view_floor
 from camera_node.simulation.scene import Scene, SceneCamera
 
 WHITE, BLACK = 215.0, 28.0  # grey levels of paper and print without vignetting
-SUBSAMPLES = 3  # each pixel has 3 x 3 sub-samples; the error at edges is then below 0.5 % of the contrast
 NEAR_M = 0.05  # discs that come nearer to the camera's plane are not drawn
 NOISE_SHIFTS = 128  # pixels; all frames use one noise image, shifted at random by less than this
 

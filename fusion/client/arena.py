@@ -18,11 +18,10 @@ from typing import Any
 import zenoh
 
 from calib.live.rig_requests import (
-    redo_rig,
     request_rig_history,
     request_rig_message,
     set_rig,
-    undo_rig,
+    step_rig,
 )
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigHistory, RigMessage
@@ -225,11 +224,11 @@ class Arena:
 
         Returns and raises as `set_rig`.
         """
-        return undo_rig(self.session, self.keys.arena, "fusion.client")
+        return step_rig(self.session, self.keys.arena, "undo", "fusion.client")
 
     def redo_rig(self) -> RigMessage:
         """Have the server redo the change of its rig that was undone last; returns and raises as `set_rig`."""
-        return redo_rig(self.session, self.keys.arena, "fusion.client")
+        return step_rig(self.session, self.keys.arena, "redo", "fusion.client")
 
     def rig_history(self) -> RigHistory:
         """All versions of the server's rig, oldest first; raises as `set_rig`."""

@@ -2,13 +2,13 @@
 """`roundel history`, `roundel undo` and `roundel redo`: list the versions of the running server's rig, and step through
 them."""
 
-from collections.abc import Callable
 from datetime import datetime
 
 import zenoh
 
-from calib.live.rig_requests import redo_rig, request_rig, request_rig_history, undo_rig
-from calib.rig.rig_messages import RigMessage, RigVersion
+from calib.live.rig_requests import request_rig, request_rig_history, step_rig
+from calib.rig.file_history import Step
+from calib.rig.rig_messages import RigVersion
 from camera_node.foundation.errors import printable
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
@@ -55,7 +55,7 @@ def undo(
         connection: the arena's server.
     """
     with connection.open() as session:
-        say(_step(session, connection.arena, undo_rig, "undone"))
+        say(_take(session, connection.arena, "undo"))
     return 0
 
 
@@ -69,20 +69,17 @@ def redo(
         connection: the arena's server.
     """
     with connection.open() as session:
-        say(_step(session, connection.arena, redo_rig, "redone"))
+        say(_take(session, connection.arena, "redo"))
     return 0
 
 
-def _step(session: zenoh.Session, arena: str, step: Callable[..., RigMessage], word: str) -> str:
+def _take(session: zenoh.Session, arena: str, step: Step) -> str:
     """Change the server's rig; returns a sentence about the result."""
     before, history = request_rig(session, arena), request_rig_history(session, arena)
-    version = history.next_undo() if step is undo_rig else history.next_redo()
-    program = f"roundel {step.__name__.removesuffix('_rig')}"
-    after = step(session, arena, program, rig_t_ns=history.rig_t_ns).rig
+    after = step_rig(session, arena, step, f"roundel {step}", rig_t_ns=history.rig_t_ns).rig
     old = before.cameras if before else {}
     changed = [name for name in {**old, **after.cameras} if old.get(name) != after.cameras.get(name)]
-    what = printable(version.describe()) if version else "the last change"
-    text = f"{word} on the server: {what}; changed cameras: {', '.join(changed) or 'none'}"
-    if step is undo_rig and before and (name := corrected_camera(before, after)):
+    text = f"{history.describe_step(step)}; changed cameras: {', '.join(changed) or 'none'}"
+    if step == "undo" and before and (name := corrected_camera(before, after)):
         text += f"; {name} is no longer monitored"
     return text

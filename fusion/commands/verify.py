@@ -20,6 +20,7 @@ from calib.rig.wand_file import WandBody, load_wand
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say, track
+from camera_node.protocol.requests import REQUEST_S
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.client.arena import Arena
 from fusion.diagnosis.verification import LENGTH_SIGMA_M, Verification, Verifier
@@ -37,7 +38,6 @@ from fusion.recordings.offline_fusion import (
 
 HOLDS, DIFFERS = 0, 1  # exit codes; 2 for mistakes, and where the object was not seen
 MAX_SECONDS = 600.0
-ANSWER_S = 5.0
 WAIT_S = 0.2  # between two looks at what has arrived
 
 
@@ -141,7 +141,7 @@ class Verify:
         return cameras, verifier.report()
 
     def _placed_cameras(self, client: Arena) -> dict[str, Camera]:
-        rig = client.rig(ANSWER_S)
+        rig = client.rig(REQUEST_S)
         if rig is None or not rig.placed():
             raise ConfigError("the server has no calibration; run roundel calibrate wand --live")
         if self.rig is not None and load_rig(self.rig).placed() != rig.placed():

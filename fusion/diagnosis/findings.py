@@ -17,7 +17,7 @@ from typing import Literal
 import msgspec
 import zenoh
 
-from calib.rig.rig import Rig, load_rig
+from calib.rig.rig import MAX_CAMERAS, Rig, load_rig
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.messages import CameraStatus
 from fusion.client.arena import Arena
@@ -40,7 +40,6 @@ MIN_FREE_GB = 2.0
 INSTALL = "install it with python -m pip install '.[server]'"
 RENEW = "renew it as docs/security.md describes"
 LISTEN_S = 2.5  # at least two statuses of every camera
-MAX_CAMERAS = 256
 MAX_CLOCK_ERROR_MS = 1.0  # a robot at 1 m/s moves 1 mm in this time
 SKIPPED = "late: a slow network or machine; refused: see docs/troubleshooting.md"
 REMEDIES = {

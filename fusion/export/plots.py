@@ -16,7 +16,7 @@ from camera_node.foundation.config import new_path
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
 from camera_node.protocol.messages import MessageError, decode
-from fusion.export.recorded_poses import RecordedPoses
+from fusion.export.recorded_poses import MM, RecordedPoses
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 MAX_POINTS = 1 << 12  # of a curve: twice as many as a page has pixels; 50 robots with 16,384 took 600 MB
 SUFFIXES = (".png", ".pdf", ".svg")
-MM = 1000.0
 ARROW_M = 0.4  # the length of a camera's optical axis in the top view
 AXES = "xyz"
 

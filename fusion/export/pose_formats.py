@@ -20,7 +20,7 @@ from fusion.bridges.ros2_messages import odometries, pose_stamped, transforms
 from fusion.bridges.ros2_node import ros_name
 from fusion.bridges.ros2_types import ODOMETRY, POSE_STAMPED, TRANSFORMS
 from fusion.export.points import PointTrajectories
-from fusion.export.recorded_poses import RecordedPoses
+from fusion.export.recorded_poses import MM, RecordedPoses
 from fusion.protocol.pose_messages import RobotPose
 
 Format = Literal["c3d", "trc", "csv", "tum", "parquet", "rerun", "rosbag", "foxglove", "observations"]
@@ -35,7 +35,6 @@ FORMATS: dict[str, Format] = {  # of `roundel export`, by suffix
     ".mcap": "foxglove",
 }
 MAX_FRAMES = 65535  # of a C3D file, whose counter has 16 bits
-MM = 1000.0
 TRAIL_M = 0.004  # radius of a drawn trail
 ROW_GROUP = 1 << 12  # rows of a Parquet file, each of 2 kB in memory and again as columns
 COLUMNS = "t_ns,robot,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,state,n_markers,n_cameras"

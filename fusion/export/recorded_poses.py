@@ -13,6 +13,8 @@ from camera_node.protocol.messages import MessageError, decode
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import RobotPose, Robots
 
+MM = 1000.0  # in a metre
+
 
 class RecordedPoses:
     """The poses of a recording; iterating reads the file.

@@ -8,14 +8,14 @@ from functools import partial
 
 import zenoh
 
+from calib.rig.file_history import Step
 from calib.rig.rig_messages import (
     RigMessage,
     RigRequest,
     RigStepRequest,
-    redo_rig_key,
     rig_history_key,
+    rig_step_key,
     set_rig_key,
-    undo_rig_key,
 )
 from camera_node.foundation.logs import about
 from camera_node.foundation.rate_limit import RateLimit
@@ -89,8 +89,18 @@ class ArenaQueries:
         transport.answer_on_server_thread(rig_history_key(arena), self._answer_history)
         for key, change, answer, prepare in (
             (set_rig_key(arena), "change of the rig", self._set_rig, _prepare_lenses),
-            (undo_rig_key(arena), "undo of the rig", self._undo_rig, self._prepare_step),
-            (redo_rig_key(arena), "redo of the rig", self._redo_rig, self._prepare_step),
+            (
+                rig_step_key(arena, "undo"),
+                "undo of the rig",
+                partial(self._step_rig, "undo"),
+                self._prepare_step,
+            ),
+            (
+                rig_step_key(arena, "redo"),
+                "redo of the rig",
+                partial(self._step_rig, "redo"),
+                self._prepare_step,
+            ),
         ):
             transport.answer_on_server_thread(key, audit.audited(change, answer), prepare)
 
@@ -109,15 +119,11 @@ class ArenaQueries:
         self._pipeline.replace_rig(request.rig, self._clock.now_ns(), request.source)
         return self._announce_rig(query, "changed", request.source)
 
-    def _undo_rig(self, query: zenoh.Query) -> bytes:
+    def _step_rig(self, step: Step, query: zenoh.Query) -> bytes:
         request = self._parse_step(query)
-        self._pipeline.undo_rig(self._clock.now_ns(), request.source)
-        return self._announce_rig(query, "set back to the previous one", request.source)
-
-    def _redo_rig(self, query: zenoh.Query) -> bytes:
-        request = self._parse_step(query)
-        self._pipeline.redo_rig(self._clock.now_ns(), request.source)
-        return self._announce_rig(query, "set to the one that was undone", request.source)
+        self._pipeline.step_rig(step, self._clock.now_ns(), request.source)
+        change = "set back to the previous one" if step == "undo" else "set to the one that was undone"
+        return self._announce_rig(query, change, request.source)
 
     def _parse_step(self, query: zenoh.Query) -> RigStepRequest:
         payload = payload_of(query)

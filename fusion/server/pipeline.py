@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calib.rig.camera import Camera
+from calib.rig.file_history import Step
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import RoundelError
@@ -96,20 +97,17 @@ class TrackingPipeline:
         self._use(rig, lambda: self.active_rig.rename(before, after))
         self.active_rig.use(rig, now_ns, source)
 
-    def undo_rig(self, now_ns: int, source: RequestSource | None = None) -> None:
-        """Restore the rig before the last change. A camera that the server recalibrated is no longer monitored.
+    def step_rig(self, step: Step, now_ns: int, source: RequestSource | None = None) -> None:
+        """Restore the rig before the last change, or the one that was undone last.
+
+        A camera is no longer monitored once the server's recalibration of it is undone.
 
         Raises:
             FusionError, ConfigError, CalibrationError: there is none, or it can't be used.
         """
-        undone, rig = self.active_rig.rig, self.active_rig.previous()
-        self._use(rig, self.active_rig.undo, corrected_camera(undone, rig) if undone else None)
-        self.active_rig.use(rig, now_ns, source)
-
-    def redo_rig(self, now_ns: int, source: RequestSource | None = None) -> None:
-        """Restore the rig that was undone last; raises as `undo_rig`."""
-        rig = self.active_rig.next()
-        self._use(rig, self.active_rig.redo)
+        before, rig = self.active_rig.rig, self.active_rig.neighbour(step)
+        pinned = corrected_camera(before, rig) if before and step == "undo" else None
+        self._use(rig, lambda: self.active_rig.take(step), pinned)
         self.active_rig.use(rig, now_ns, source)
 
     def follow_rig(self, message: RigMessage) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry import codes
@@ -163,6 +164,7 @@ def ellipse_of(sight: Sight) -> tuple[Array, Array]:
     return centre, 2 * np.sqrt(np.linalg.eigvalsh(np.outer(centre, centre) - dual[:2, :2])[::-1])
 
 
-def expose(image: Array, noise: float, rng: np.random.Generator) -> Grey:
+def expose(image: ArrayLike, noise: float, rng: np.random.Generator) -> Grey:
     """An 8-bit image with Gaussian noise."""
-    return np.clip(np.rint(image + rng.normal(0, noise, image.shape)), 0, 255).astype(np.uint8)
+    light = np.asarray(image, float)
+    return np.clip(np.rint(light + rng.normal(0, noise, light.shape)), 0, 255).astype(np.uint8)

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.live.rig_requests import set_rig, undo_rig
+from calib.live.rig_requests import set_rig, step_rig
 from calib.rig.rig import Rig
 from camera_node.foundation.errors import NetworkError
 from camera_node.node.rig_lens import RigLens
@@ -68,7 +68,7 @@ def test_only_an_operator_changes_the_rig(lab: Lab):
     operator = lab.session("operator")
     assert set_rig(operator, ARENA, rig, "test").rig == rig
     with pytest.raises(RequestError, match="no earlier version"):
-        undo_rig(operator, ARENA, "test")
+        step_rig(operator, ARENA, "undo", "test")
 
 
 def test_a_camera_receives_its_lens(lab: Lab):

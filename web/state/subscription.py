@@ -10,9 +10,10 @@ from typing import Any
 import msgspec
 import zenoh
 
-from calib.live.rig_requests import redo_rig, request_rig_history, request_rig_message, undo_rig
-from calib.rig.rig_messages import RigVersion
-from camera_node.foundation.errors import RoundelError, printable
+from calib.live.rig_requests import request_rig_history, request_rig_message, step_rig
+from calib.rig.file_history import Step
+from calib.rig.rig_messages import RigHistory
+from camera_node.foundation.errors import RoundelError
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.protocol.camera_requests import request_settings, request_snapshot
 from camera_node.protocol.messages import MessageError, Settings, decode
@@ -105,22 +106,19 @@ class Subscription:
         self.feed.store_robots(robots)
         return robots
 
-    def undo(self, timeout_s: float = REQUEST_S) -> str:
-        """Have the server undo the last change of its rig; return the outcome as text.
+    def step_rig(self, step: Step, timeout_s: float = REQUEST_S) -> str:
+        """Have the server undo the last change of its rig, or redo the one that was undone last.
+
+        Returns:
+            The outcome as text.
 
         Raises:
             RequestError: the server refuses, as it does where there is none.
             NetworkError: it does not answer.
         """
-        history = self.feed.state().history
-        undo_rig(self.session, self.feed.keys.arena, "web", timeout_s, history.rig_t_ns if history else None)
-        return _describe_step("undone", history.next_undo() if history else None)
-
-    def redo(self, timeout_s: float = REQUEST_S) -> str:
-        """Have the server redo the change of its rig that was undone last; returns and raises as `undo`."""
-        history = self.feed.state().history
-        redo_rig(self.session, self.feed.keys.arena, "web", timeout_s, history.rig_t_ns if history else None)
-        return _describe_step("redone", history.next_redo() if history else None)
+        history = self.feed.state().history or RigHistory()
+        step_rig(self.session, self.feed.keys.arena, step, "web", timeout_s, history.rig_t_ns)
+        return history.describe_step(step)
 
     def _declare(self, session: zenoh.Session) -> None:
         keys = self.feed.keys
@@ -196,7 +194,3 @@ def _ask(limit: RateLimit, what: str, request: Callable[[], None]) -> None:
     asking = guarded(f"a request for the {what}", ask)
     if limit.passes():
         threading.Thread(target=asking, args=[None], name=what, daemon=True).start()
-
-
-def _describe_step(word: str, version: RigVersion | None) -> str:
-    return f"{word} on the server: {printable(version.describe()) if version else 'the last change'}"

@@ -4,6 +4,7 @@ it: it is written to the rig's file, and in force on the server."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import viser
@@ -62,8 +63,8 @@ class RigHistoryPanel:
         with gui.add_folder("History of the calibration"):
             self._table = gui.add_html(tabulate_history(None).html())
             answer = Answer(gui)
-            self._undo = ActionButton(gui, UNDO, subscription.undo, answer)
-            self._redo = ActionButton(gui, REDO, subscription.redo, answer)
+            self._undo = ActionButton(gui, UNDO, partial(subscription.step_rig, "undo"), answer)
+            self._redo = ActionButton(gui, REDO, partial(subscription.step_rig, "redo"), answer)
 
     def update(self, state: ArenaState) -> None:
         """Enable the buttons while there is something to restore."""
@@ -72,8 +73,8 @@ class RigHistoryPanel:
             set_content(self._table, tabulate_history(state.history).html())
         history = state.history or RigHistory()
         for button, label, version in (
-            (self._undo, UNDO, history.next_undo()),
-            (self._redo, REDO, history.next_redo()),
+            (self._undo, UNDO, history.subject("undo")),
+            (self._redo, REDO, history.subject("redo")),
         ):
             what = f": {printable(version.change, MAX_LABEL)}" if version and version.change else ""
             button.show(enabled=state.server_alive and version is not None, label=label + what)

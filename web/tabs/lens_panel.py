@@ -33,7 +33,6 @@ BOARD = "charuco:5x7:0.035"  # of `roundel print board`
 MODELS = ("pinhole", "fisheye")
 WIDE = "fisheye for lenses beyond 120 degrees"
 CAPTURE_S = 180.0
-CLOSE_S = 5.0
 LABELS = ("Calibrate the lens with a board", "End, and calibrate")
 BOARD_HINT = (
     "charuco:COLUMNSxROWS:SQUARE_M as roundel print board writes it, or chessboard:COLUMNSxROWS:SQUARE_M"
@@ -96,7 +95,7 @@ class LensPanel:
 
     def close(self) -> None:
         """End a capture."""
-        self._capture.close(CLOSE_S)
+        self._capture.close()
 
     def _forget(self) -> str:
         set_content(self._cells, "")

@@ -32,7 +32,6 @@ from web.widgets import ActionButton, Answer, ConfirmedButton, LongAction, set_c
 LIST_INTERVAL = 9  # updates from one look at the folder to the next: about 3 s
 NO_RECORDING = "no recording yet"
 NAME_HINT = "of the file; empty for date and time"
-CLOSE_S = 5.0  # for a recording to be completed when the page closes
 RECORDING_COLUMNS = (
     Column("recording"),
     Column(
@@ -74,7 +73,7 @@ class Recorder:
 
     def close(self) -> None:
         """Complete the recording."""
-        self.action.close(CLOSE_S)
+        self.action.close()
 
     def _record(self, end: threading.Event) -> str:
         """Record until `end`; returns the outcome. Raises ConfigError if the file exists or can't be written."""

@@ -33,7 +33,6 @@ from web.tabs.calibration_panels import CalibrationFiles, apply_rig, current_rig
 from web.widgets import Answer, Decision, LongAction, set_content
 
 SOLVE_S = 600.0  # limit for `roundel calibrate wand`
-CLOSE_S = 5.0  # for the recording to be saved when the page closes
 WAND_COLUMNS = (
     Column("camera"),
     Column("frames", "", "frames in which the camera saw the wand"),
@@ -101,7 +100,7 @@ class WandSessionPanel:
 
     def close(self) -> None:
         """End the session and save its recording, without calibrating."""
-        self.session.close(CLOSE_S)
+        self.session.close()
 
     def _calibrate(self, end: threading.Event) -> str:
         self.decision.clear()

@@ -13,7 +13,7 @@ from typing import Literal
 
 import msgspec
 
-from calib.rig.file_history import History
+from calib.rig.file_history import History, Step
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from calib.rig.rig_messages import (
     MAX_CHANGE,
@@ -155,19 +155,15 @@ class ActiveRig:
             saved = False
         self.use(rig, now_ns, saved=saved)
 
-    def previous(self) -> Rig:
-        """The rig that `undo` restores.
+    def neighbour(self, step: Step) -> Rig:
+        """The rig that a step restores.
 
         Raises:
             CalibrationError, ConfigError: there is none, or its file is broken.
         """
-        if self._history.path.exists():
+        if step == "undo" and self._history.path.exists():
             self._save_active()
-        return load_rig(self._history.previous())
-
-    def next(self) -> Rig:
-        """The rig that `redo` restores; raises as `previous`."""
-        return load_rig(self._history.next())
+        return load_rig(self._history.neighbour(step))
 
     def earlier(self) -> list[Rig]:
         """The rigs from the calibration on that the server's corrections changed, oldest first, to the one in use.
@@ -226,14 +222,9 @@ class ActiveRig:
         """Whether the rig was never saved or changed: it has no history yet."""
         return self._files is None and self._saved is None
 
-    def undo(self) -> None:
-        """Restore the file of the previous rig; raises as `previous`."""
-        self._history.undo()
-        self._record_given()
-
-    def redo(self) -> None:
-        """Restore the file of the rig that was undone last; raises as `previous`."""
-        self._history.redo()
+    def take(self, step: Step) -> None:
+        """Restore the file of that rig; raises as `neighbour`."""
+        self._history.take(step)
         self._record_given()
 
     def _record_given(self) -> None:

@@ -16,7 +16,7 @@ import msgspec
 import tyro
 import zenoh
 
-from calib.rig.rig_messages import redo_rig_key, rig_history_key, undo_rig_key
+from calib.rig.rig_messages import rig_history_key, rig_step_key
 from camera_node.foundation.terminal import say
 from camera_node.protocol.messages import Keys, Settings
 from camera_node.protocol.registration import assigned_key, change_key, register_key, registered_key
@@ -230,8 +230,8 @@ class Fuzzer:
                 "height": 480,
             },
             change_key(self.arena): {"version": 1, "camera": "ghost0", "name": "ghost1", "forget": True},
-            undo_rig_key(self.arena): {"version": 1, "source": {"program": "fuzzer"}},
-            redo_rig_key(self.arena): {"version": 1, "source": {"program": "fuzzer"}},
+            rig_step_key(self.arena, "undo"): {"version": 1, "source": {"program": "fuzzer"}},
+            rig_step_key(self.arena, "redo"): {"version": 1, "source": {"program": "fuzzer"}},
         }
         key = self.rng.choice(sorted(requests))
         self._get(key, certainly_invalid(requests[key], self.rng) or b"\xc1", "registry and history")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from calib.errors import CalibrationError
-from calib.rig.file_history import MAX_OLD, History
+from calib.rig.file_history import MAX_OLD, History, Step
 from calib.rig.rig import Rig, load_rig, save_rig
 from camera_node.foundation.errors import ConfigError
 from tests.calib.synthetic import ring
@@ -40,17 +40,17 @@ def test_undo_and_redo_step_through_all_versions(tmp_path: Path):
     history = History(path)
     assert [p.name for p in history.older()] == [f"rig.{k}.yaml" for k in range(1, 12)]  # 10 after 9
     for k in reversed(range(11)):
-        step = history.undo()
+        step = history.take("undo")
         assert step.replaced is not None
         assert (number_of(path), number_of(step.replaced)) == (k, k + 1)
         assert all_numbers(tmp_path) == set(range(12))
     with pytest.raises(CalibrationError, match=r"no earlier version of .*rig\.yaml; nothing was changed"):
-        history.undo()
+        history.take("undo")
     for k in range(1, 12):
-        history.redo()
+        history.take("redo")
         assert number_of(path) == k
     with pytest.raises(CalibrationError, match="no undone version"):
-        history.redo()
+        history.take("redo")
     assert names(tmp_path) == sorted(["rig.yaml", *(f"rig.{k}.yaml" for k in range(1, 12))])
 
 
@@ -59,12 +59,12 @@ def test_undone_rigs_are_reached_by_undo_after_a_new_calibration(tmp_path: Path)
     for k in range(3):
         save_rig(numbered(k), path)
     history = History(path)
-    history.undo()
-    history.undo()
+    history.take("undo")
+    history.take("undo")
     save_rig(numbered(3), path)
     seen = [number_of(path)]
     for _ in range(3):
-        history.undo()
+        history.take("undo")
         seen.append(number_of(path))
     assert seen == [3, 0, 1, 2]
 
@@ -74,7 +74,7 @@ def test_at_most_twenty_old_rigs_are_kept(tmp_path: Path):
     for k in range(2 * MAX_OLD):
         save_rig(numbered(k), path)
     assert all_numbers(tmp_path) == set(range(MAX_OLD - 1, 2 * MAX_OLD))
-    History(path).undo()
+    History(path).take("undo")
     save_rig(numbered(99), path)
     assert len(names(tmp_path)) == MAX_OLD + 1
 
@@ -84,7 +84,7 @@ def test_undo_restores_a_deleted_rig(tmp_path: Path):
     for k in range(2):
         save_rig(numbered(k), path)
     path.unlink()
-    assert History(path).undo().replaced is None
+    assert History(path).take("undo").replaced is None
     assert number_of(path) == 0
 
 
@@ -100,7 +100,7 @@ def test_other_files_in_the_folder_are_ignored(tmp_path: Path):
 
 def test_undo_in_a_missing_folder_is_a_config_error(tmp_path: Path):
     with pytest.raises(ConfigError, match="folder"):
-        History(tmp_path / "nowhere" / "rig.yaml").undo()
+        History(tmp_path / "nowhere" / "rig.yaml").take("undo")
 
 
 # Kills itself at the n-th operation on a file, in a fork of this process; prints the number of operations.
@@ -114,7 +114,7 @@ rig = load_rig(folder / "new.yaml")
 
 def act():
     path = folder / str(n) / "rig.yaml"
-    save_rig(rig, path) if step == "save" else getattr(History(path), step)()
+    save_rig(rig, path) if step == "save" else History(path).take(step)
 
 while (child := os.fork()):
     died = os.WIFSIGNALED(os.waitpid(child, 0)[1])
@@ -146,7 +146,7 @@ def test_a_process_that_is_killed_at_any_step_leaves_a_readable_rig_and_all_vers
         path.parent.mkdir()
         for k in range(4):
             save_rig(numbered(k), path)
-        History(path).undo()
+        History(path).take("undo")
     save_rig(numbered(9), tmp_path / "new.yaml")
     words = [sys.executable, "-c", KILLED, str(tmp_path), step]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
@@ -163,12 +163,12 @@ def test_a_process_that_is_killed_at_any_step_leaves_a_readable_rig_and_all_vers
         assert {*undone, *redone} >= {0, 1, 2, 3}
 
 
-def steps(path: Path, direction: str) -> list[int]:
+def steps(path: Path, direction: Step) -> list[int]:
     """The rigs from the present one to the first or last."""
     seen = [number_of(path)]
     while True:
         try:
-            getattr(History(path), direction)()
+            History(path).take(direction)
         except CalibrationError:
             return seen
         seen.append(number_of(path))

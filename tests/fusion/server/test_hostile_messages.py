@@ -17,7 +17,7 @@ import psutil
 import pytest
 import zenoh
 
-from calib.rig.rig_messages import redo_rig_key, set_rig_key, undo_rig_key
+from calib.rig.rig_messages import rig_step_key, set_rig_key
 from camera_node.protocol.messages import encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
@@ -31,8 +31,8 @@ DETECTIONS = msgspec.msgpack.decode(encode(live(ARENA.messages(1))[0]))
 MAX_GROWTH_MB = 250.0  # of a process: what the queues of a few keys hold of the largest messages
 QUERIES = (
     set_rig_key("test"),
-    undo_rig_key("test"),
-    redo_rig_key("test"),
+    rig_step_key("test", "undo"),
+    rig_step_key("test", "redo"),
     robots_key("test"),
     set_robots_key("test"),
     KEYS.clock,

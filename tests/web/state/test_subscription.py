@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 from calib.rig.rig import Rig
-from calib.rig.rig_messages import RigMessage, undo_rig_key
+from calib.rig.rig_messages import RigMessage, rig_step_key
 from camera_node.foundation.errors import NetworkError, RoundelError
 from camera_node.protocol.messages import encode
 from camera_node.protocol.server_connection import ServerConnection
@@ -66,8 +66,8 @@ def test_frame_sets_that_locate_nothing_do_not_hide_a_marker(arena: LiveArena, s
 def test_undo_returns_the_server_s_answer(arena: LiveArena, subscription: Subscription):
     """No answer, then a refusal in the server's words, then success."""
     with pytest.raises(NetworkError, match="no server"):
-        subscription.undo(timeout_s=0.2)
-    key = undo_rig_key("test")
+        subscription.step_rig("undo", timeout_s=0.2)
+    key = rig_step_key("test", "undo")
     message = encode(RigMessage(t_ns=0, rig=Rig(cameras={})))
     granted = [False]
 
@@ -81,13 +81,13 @@ def test_undo_returns_the_server_s_answer(arena: LiveArena, subscription: Subscr
     queryable = arena.session.declare_queryable(key, answer)
     wait_for(lambda: outcome(subscription) == "nothing to undo")
     granted[0] = True
-    assert "undone on the server: the last change" in subscription.undo(timeout_s=5.0)
+    assert "undone on the server: the last change" in subscription.step_rig("undo", timeout_s=5.0)
     queryable.undeclare()
 
 
 def outcome(subscription: Subscription) -> str:
     """The server's answer to an undo, or why there is none."""
     try:
-        return subscription.undo(timeout_s=0.5)
+        return subscription.step_rig("undo", timeout_s=0.5)
     except RoundelError as error:
         return str(error)

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from calib.live.rig_requests import set_rig, undo_rig
+from calib.live.rig_requests import set_rig, step_rig
 from calib.rig.file_history import MAX_OLD, History
 from calib.rig.rig import Rig, dump_rig, load_rig, save_rig
 from calib.rig.rig_messages import RigHistory, SavedChange
@@ -236,7 +236,7 @@ def test_a_file_that_the_sender_wrote_before_is_one_step(tmp_path: Path, step: s
         if step == "set":
             save_rig(numbered(3), path)
         else:
-            History(path).undo()
+            History(path).take("undo")
         client.set_rig(load_rig(path))
         offsets = [offset_of(load_rig(tmp_path / version.file)) for version in client.rig_history().versions]
         assert offsets == ([1, 2, 3] if step == "set" else [1, 2])
@@ -374,10 +374,10 @@ def test_an_undo_that_arrives_twice_undoes_one_change(tmp_path: Path):
     with serving(saving(tmp_path)) as (_, client):
         client.set_rig(numbered(1))
         seen = client.set_rig(numbered(2)).t_ns
-        assert undo_rig(client.session, "test", "test", rig_t_ns=seen).rig == numbered(1)
+        assert step_rig(client.session, "test", "undo", "test", rig_t_ns=seen).rig == numbered(1)
         with pytest.raises(RequestError, match="nothing was done, because the rig has changed"):
-            undo_rig(client.session, "test", "test", rig_t_ns=seen)
-        assert client.rig_history().next_redo() is not None
+            step_rig(client.session, "test", "undo", "test", rig_t_ns=seen)
+        assert client.rig_history().subject("redo") is not None
         assert client.undo_rig().rig == GIVEN
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from calib.live.rig_requests import redo_rig, set_rig, undo_rig
+from calib.live.rig_requests import set_rig, step_rig
 from calib.rig.rig import Rig
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
@@ -120,8 +120,8 @@ def test_changes_of_the_rig_are_noted_with_their_claimed_source(
         assert rig is not None
         cameras = {name: rig.cameras[name] for name in sorted(rig.cameras)[:3]}
         set_rig(client.session, "test", Rig(cameras=cameras), "calib wand")
-        undo_rig(client.session, "test", "calib undo")
-        redo_rig(client.session, "test", "calib redo")
+        step_rig(client.session, "test", "undo", "calib undo")
+        step_rig(client.session, "test", "redo", "calib redo")
     assert [(line["change"], line["claimed_source"]["program"]) for line in lines(audit)] == [
         ("change of the rig", "calib wand"),
         ("undo of the rig", "calib undo"),
