@@ -162,7 +162,8 @@ def _figures(state: ArenaState) -> str:
     )
     cameras = _count(len(state.cameras), "camera")
     robots = f"{_count(tracked, 'robot')} tracked"
-    return f"{cameras}, {robots}, {status.frame_sets_per_s:.0f} poses/s{latency}"
+    rate = f", {status.frame_sets_per_s:.0f} poses/s" if tracked else ""
+    return f"{cameras}, {robots}{rate}{latency}"
 
 
 def _count(n: int, noun: str) -> str:

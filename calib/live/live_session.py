@@ -126,7 +126,9 @@ def _advise(collected: CollectedFrames, elapsed: float, trial: Trial | None, eno
             f"no roundel has moved for {still_s:.0f} s: wave on, or end the session; once all cameras are placed it "
             f"ends by itself after {GONE_S:.0f} s"
         )
-    return _advise_by(trial) if trial is not None else "wave the wand where two cameras or more see it"
+    if trial is not None:
+        return _advise_by(trial)
+    return "wave the wand where two cameras or more see it; no result is computed yet"
 
 
 def _advise_by(trial: Trial) -> str:

@@ -133,7 +133,10 @@ def describe_calibration(calibration: Calibration) -> str:
     if not calibration.placed:
         return "not calibrated"
     grade = f" of grade {calibration.grade}" if calibration.grade else ""
-    age = "no date recorded" if calibration.age_days is None else f"{calibration.age_days:.0f} days old"
+    days = calibration.age_days
+    age = (
+        "no date recorded" if days is None else f"{days:.0f} days old" if days >= 1 else "less than a day old"
+    )
     return f"calibration{grade}, {age}"
 
 

@@ -3,8 +3,8 @@
 
 Rows are simulated recordings (`tests.calib.recordings`), and the real recordings of ../shared/data if they are beside
 the checkout. Times are processor seconds, and in brackets multiples of a Cholesky factorization of 1500 x 1500 in the
-same run. `honesty` measures whether covariances are true (`calibration_honesty`), and `data` compares with a plain
-bundle adjustment (`calibration_data`).
+same run. `honesty` measures whether covariances are true (`calibration_honesty`), `acceptance` the same of hard
+recordings (`calibration_acceptance`), and `data` compares with a plain bundle adjustment (`calibration_data`).
 """
 
 import os
@@ -26,6 +26,7 @@ from calib.wand.calibrate import calibrate
 from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
+from tests.benchmarks.calibration_acceptance import run as run_acceptance
 from tests.benchmarks.calibration_data import run as run_data
 from tests.benchmarks.calibration_honesty import run as run_honesty
 from tests.benchmarks.calibration_recordings import DATA, SQUARE_M, board_corners, corner_errors, recording
@@ -182,7 +183,7 @@ def main(names: list[str]) -> None:
     """Print the measured figures beside their goals."""
     if unknown := [name for name in names if name not in ROWS]:
         raise SystemExit(
-            f"no rows {' '.join(unknown)}; the rows are {' '.join(ROWS)}; or give honesty or data"
+            f"no rows {' '.join(unknown)}; the rows are {' '.join(ROWS)}; or give honesty, acceptance or data"
         )
     console, unit = Console(), reference_s()
     table = Table("row", "figure", "measured", "goal")
@@ -200,9 +201,9 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["honesty"]:
-        run_honesty(sys.argv[2:])
-    elif sys.argv[1:2] == ["data"]:
-        run_data(sys.argv[2:])
+    others = {"honesty": run_honesty, "acceptance": run_acceptance, "data": run_data}
+    name, *arguments = sys.argv[1:] or [""]
+    if name in others:
+        others[name](arguments)
     else:
         main(sys.argv[1:])

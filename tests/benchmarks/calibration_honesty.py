@@ -44,7 +44,7 @@ from camera_node.foundation.arrays import Array
 from camera_node.foundation.terminal import track
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import rigid_motions
-from tests.calib.recordings import SimulatedRecording, WandScenario, record
+from tests.calib.recordings import WandScenario, record
 from tests.calib.synthetic import CAREFUL, EXACT, OLD, WAND, joint_error, roughly
 
 LIGHT = Body(diameter_m=0.05)
@@ -113,11 +113,15 @@ def measure(name: str, seed: int) -> Outcome:
         result = calibrate(LENSES[lens](recorded.intrinsics, seed), WANDS[wand], recorded.messages)
     except CalibrationError as error:
         return Outcome(name, seed, fault=str(error))
-    squared, degrees = joint_error(result, recorded.truth)
-    noise = joint_error(replace(result, covariance=noise_covariance(result)), recorded.truth)[0]
-    clocks, scale = clock_error(result, recorded), scale_error(result, recorded.truth)
-    focal = focal_error(result, recorded.truth)
-    return Outcome(name, seed, squared / degrees, noise / degrees, clocks, scale, focal)
+    return judge(name, seed, result, recorded.truth)
+
+
+def judge(cell: str, seed: int, result: WandCalibration, truth: Rig) -> Outcome:
+    """Compare a calibration with the truth."""
+    squared, degrees = joint_error(result, truth)
+    noise = joint_error(replace(result, covariance=noise_covariance(result)), truth)[0]
+    clocks, scale, focal = clock_error(result, truth), scale_error(result, truth), focal_error(result, truth)
+    return Outcome(cell, seed, squared / degrees, noise / degrees, clocks, scale, focal)
 
 
 def without_lenses(rig: Rig, seed: int) -> Rig:
@@ -150,15 +154,25 @@ def noise_covariance(result: WandCalibration) -> Array:
     return covariance.noise[:, at][:, :, :, at].reshape(size, size)
 
 
-def clock_error(result: WandCalibration, recorded: SimulatedRecording) -> float | None:
+def clock_error(result: WandCalibration, truth: Rig) -> float | None:
     """Squared Mahalanobis error of the offsets, whose mean is unobservable, over its degrees of freedom; None where
     these are not estimated."""
     if not result.time_sigma_ms.any():
         return None
-    truth = np.array([recorded.truth.cameras[name].time_offset_ms for name in result.names])
-    off = result.time_offset_ms - truth
+    off = result.time_offset_ms - [truth.cameras[name].time_offset_ms for name in result.names]
     covariance = 1e6 * camera_covariance(result.adjusted).of(OFFSET)[:, 0, :, 0]
-    complement = np.linalg.svd(np.ones((len(off), 1)))[0][:, 1:]
+    return error_of_differences(off, covariance, np.ones((len(off), 1)))
+
+
+def error_of_differences(off: Array, covariance: Array, common: Array) -> float:
+    """Squared Mahalanobis error over its degrees of freedom, without what nothing shows.
+
+    Args:
+        off: (N,) errors.
+        covariance: (N, N) their covariance.
+        common: (N, K) what may be added to all errors.
+    """
+    complement = np.linalg.svd(common)[0][:, common.shape[1] :]
     rest = complement.T @ off
     return float(rest @ np.linalg.solve(complement.T @ covariance @ complement, rest)) / len(rest)
 
@@ -192,7 +206,7 @@ def run(arguments: list[str]) -> None:
     wanted = [(name, seed) for seed in range(options.seeds) for name in chosen]
     known = {(o.cell, o.seed): o for o in load(options.save)}
     missing = [task for task in wanted if task not in known]
-    for outcome in track(compute(missing, options.jobs), "calibrating", len(missing)):
+    for outcome in track(compute(measure, missing, options.jobs), "calibrating", len(missing)):
         known[outcome.cell, outcome.seed] = outcome
         if options.save is not None:
             with options.save.open("ab") as file:
@@ -214,7 +228,9 @@ def load(path: Path | None) -> list[Outcome]:
     return [msgspec.json.decode(line, type=Outcome) for line in path.read_bytes().splitlines()]
 
 
-def compute(tasks: Sequence[tuple[str, int]], jobs: int) -> Iterator[Outcome]:
+def compute(
+    measure: Callable[[str, int], Outcome], tasks: Sequence[tuple[str, int]], jobs: int
+) -> Iterator[Outcome]:
     """Measure cells with seeds in several processes, each with one thread; yields outcomes as they come."""
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # of the processes
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:

@@ -5,6 +5,7 @@ The simulation makes detections, not images, and works on columns: a minute of s
 is printed on one side, so that opposite cameras never see it at once.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
@@ -181,3 +182,15 @@ def _place(camera: Camera, scenario: WandScenario, path: WandPath, t_s: Array) -
     T = invert(camera.matrix())
     world = np.einsum("nij,nj->ni", R, local) + place
     return world @ T[:3, :3].T + T[:3, 3], R[:, :, 2] @ T[:3, :3].T
+
+
+def with_clocks(
+    messages: Sequence[Detections], middle_ns: int, clocks: Mapping[str, tuple[float, float]]
+) -> list[Detections]:
+    """The messages with stamps that are later by an offset, s, at a time of the truth, and grow faster by a rate."""
+
+    def stamp(m: Detections) -> int:
+        offset_s, rate = clocks.get(m.camera, (0.0, 0.0))
+        return round(middle_ns + (m.t_ns - middle_ns) * (1 + rate) + 1e9 * offset_s)
+
+    return [msgspec.structs.replace(m, t_ns=stamp(m)) for m in messages]

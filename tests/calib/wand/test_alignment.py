@@ -2,7 +2,7 @@
 """Clocks that differ by up to a minute and run at other rates are found from the motion of one light."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,7 +23,7 @@ from calib.wand.nominal_lens import nominal_lens
 from calib.wand.scale import Distance
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
-from tests.calib.recordings import EPOCH_S, SimulatedRecording, WandScenario, record
+from tests.calib.recordings import EPOCH_S, SimulatedRecording, WandScenario, record, with_clocks
 from tests.calib.synthetic import EXACT, STICK, WAND, camera_errors, ring, roughly
 from tests.calib.synthetic import record as record_ring
 
@@ -56,18 +56,6 @@ def light() -> SimulatedRecording:
     return record(WAVED)
 
 
-def with_clocks(
-    messages: Sequence[Detections], clocks: Mapping[str, tuple[float, float]]
-) -> list[Detections]:
-    """The messages with stamps that are later by an offset, s, and grow faster by a rate."""
-
-    def stamp(m: Detections) -> int:
-        offset_s, rate = clocks.get(m.camera, (0.0, 0.0))
-        return round(MIDDLE_NS + (m.t_ns - MIDDLE_NS) * (1 + rate) + 1e9 * offset_s)
-
-    return [msgspec.structs.replace(m, t_ns=stamp(m)) for m in messages]
-
-
 def late_ms(recorded: SimulatedRecording, stamped: Iterable[tuple[int, Detections]]) -> dict[str, np.ndarray]:
     """By camera, how much later than the truth the stamps of messages are, in their order."""
     true_ns = {(m.camera, m.seq): m.t_ns for m in recorded.messages}
@@ -82,7 +70,7 @@ def test_offsets_of_a_minute_and_rates_of_one_percent_are_found_and_used():
     """Poses are as with equal clocks; true times follow from the rig to three of their standard deviations at its ends,
     0.45 ms, in `run` and `replay` too. One clock is right, and all share one offset that nothing shows."""
     recorded = light()
-    stamped = with_clocks(recorded.messages, PHONES)
+    stamped = with_clocks(recorded.messages, MIDDLE_NS, PHONES)
     gap = recorded.truth.cameras["cam00"].matrix()[:3, 3] - recorded.truth.cameras["cam02"].matrix()[:3, 3]
     distance = Distance.of(
         ("cam00", "cam02", float(np.linalg.norm(gap))), 0.001, list(recorded.truth.cameras)
@@ -109,7 +97,7 @@ def test_offsets_of_a_minute_and_rates_of_one_percent_are_found_and_used():
 @pytest.mark.slow
 def test_a_shift_of_seconds_is_named_as_such():
     recorded = light()
-    stamped = with_clocks(recorded.messages, {"cam01": (13.6, 0.0)})
+    stamped = with_clocks(recorded.messages, MIDDLE_NS, {"cam01": (13.6, 0.0)})
     result = calibrate(recorded.intrinsics, LIGHT, stamped)
     assert len(result.names) == 3
     assert "camera 'cam01' the stamps are 13.6 s later than those of the others" in result.report.timing
@@ -140,7 +128,7 @@ def test_drifts_are_stored_and_hold_at_both_ends_of_a_recording(tmp_path: Path):
 def test_clocks_before_a_slow_wand_are_found(seed: int):
     """Twenty seconds of a hand that moves below 0.4 Hz: many shifts correlate as well as the right one."""
     recorded = record(replace(WAVED, cameras=2, seconds=20, speed=0.3, wand=STICK, seed=seed))
-    stamped = with_clocks(recorded.messages, {"cam01": (12.7, 0.008)})
+    stamped = with_clocks(recorded.messages, MIDDLE_NS, {"cam01": (12.7, 0.008)})
     nominal = Rig(
         cameras={name: nominal_lens(c.width, c.height) for name, c in recorded.truth.cameras.items()}
     )
@@ -163,8 +151,8 @@ def test_motions_of_different_wands_are_not_aligned():
 def test_clocks_that_a_server_keeps_are_not_changed():
     recorded = light()
     bounded = [msgspec.structs.replace(m, clock_error_us=500.0) for m in recorded.messages]
-    assert not align_clocks(recorded.intrinsics, LIGHT, with_clocks(bounded, PHONES)).maps
-    assert align_clocks(recorded.intrinsics, LIGHT, with_clocks(recorded.messages, PHONES)).maps
+    assert not align_clocks(recorded.intrinsics, LIGHT, with_clocks(bounded, MIDDLE_NS, PHONES)).maps
+    assert align_clocks(recorded.intrinsics, LIGHT, with_clocks(recorded.messages, MIDDLE_NS, PHONES)).maps
 
 
 @pytest.mark.parametrize("seconds", [8.0, 20.0])

@@ -2,7 +2,7 @@
 """Cameras that see different sides of the wand are joined by its pose as a rigid body."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -20,58 +20,12 @@ from calib.wand.detections import MarkerTrack
 from calib.wand.initial_rig import TwoViewGeometry, build_initial_rig
 from calib.wand.labels import label_recording
 from camera_node.detection.roundels import Roundels
-from camera_node.foundation.arrays import Array, Mask
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import read_observations
-from tests.calib.synthetic import CAREFUL, Arena, camera_errors, joint_error, ring, roughly
-
-HALF, SIGMA_PX = 0.15, 0.2
-CORNERS = 0.8 * HALF * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-NORMALS = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
-UPRIGHT = np.array([0.0, 0.0, 1.0])
-
-
-def cube() -> WandBody:
-    """Four markers on each of the upright sides of a cube, numbered side by side."""
-    points = [
-        HALF * normal + u * np.cross(UPRIGHT, normal) + v * UPRIGHT for normal in NORMALS for u, v in CORNERS
-    ]
-    return WandBody(markers=tuple(map(tuple, np.array(points).tolist())))
-
-
-CUBE = cube()
-
-
-def sees_sides(most: int) -> Callable[[Array], Mask]:
-    """The sides (4,) that a camera sees, from the cosines (4,) of the angles at which they face it: up to `most`."""
-
-    def choose(cosine: Array) -> Mask:
-        chosen = np.zeros(4, bool)
-        chosen[np.argsort(-cosine)[:most]] = True
-        return chosen & (cosine > 0.2)
-
-    return choose
-
-
-def wave(
-    arena: Arena, sides: int, frames: int, seed: int, period_ns: int = 500_000_000, phase: float = 0.0
-) -> list[Detections]:
-    """Record the cube with the sides that face each camera most, numbered; `phase` of a period from camera to
-    camera."""
-    rng, messages, choose = np.random.default_rng(seed), [], sees_sides(sides)
-    for seq in range(frames):
-        for number, (name, camera) in enumerate(arena.truth.cameras.items()):
-            t_ns = int((seq + phase * number) * period_ns)
-            T = arena.wand_pose(1e-9 * t_ns)
-            points, place = transform(T, CUBE.points), camera.matrix()[:3, 3] - T[:3, 3]
-            chosen = choose(NORMALS @ T[:3, :3].T @ place / np.linalg.norm(place))
-            uv = camera.project_world(points) + SIGMA_PX * rng.standard_normal((16, 2))
-            seen = np.flatnonzero(np.repeat(chosen, 4) & camera.sees(uv))
-            roundels = Roundels.from_points(uv[seen], SIGMA_PX, seen.astype(np.int32))
-            header = {"camera": name, "width": camera.width, "height": camera.height}
-            messages.append(Detections.pack(roundels, seq=seq, t_ns=t_ns, **header))
-    return messages
+from tests.calib.cube import CORNERS, CUBE, SIGMA_PX, one_after_the_other, wave
+from tests.calib.synthetic import CAREFUL, camera_errors, joint_error, ring, roughly
 
 
 def only(messages: list[Detections], name: str, keep: Callable[[Detections], bool]) -> list[Detections]:
@@ -128,16 +82,6 @@ def test_cameras_that_never_saw_the_wand_together_are_named_with_what_would_conn
     assert set(result.report.unplaced) in ({"cam0", "cam1"}, {"cam2", "cam3"})
     for reason in result.report.unplaced.values():
         assert "any side of the wand" in reason
-
-
-def one_after_the_other(groups: Sequence[int], frames: int) -> tuple[Arena, list[Detections]]:
-    """A recording of an arena that is divided along x between groups of cameras: no two groups see the wand at once."""
-    arena = ring(sum(groups), wand=CUBE, speed=3.0)
-    group_of = dict(zip(arena.truth.cameras, np.repeat(np.arange(len(groups)), groups).tolist(), strict=True))
-    edges = np.linspace(-0.5, 0.5, len(groups) + 1)[1:-1]
-    messages = wave(arena, 2, frames, 0, period_ns=33_000_000, phase=0.24)
-    place = {m.t_ns: arena.wand_pose(1e-9 * m.t_ns)[0, 3] for m in messages}
-    return arena, [m for m in messages if group_of[m.camera] == np.searchsorted(edges, place[m.t_ns])]
 
 
 def test_cameras_that_see_the_wand_one_after_the_other_get_an_initial_pose():

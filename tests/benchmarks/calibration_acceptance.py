@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Whether hard recordings are calibrated, and their claims true: `python -m tests.benchmarks.calibration acceptance`.
+
+Figures are those of `calibration_honesty`: mean squared errors in standard deviations, 1 for true claims. Lenses that a
+recording does not determine are named, with the interval that is claimed. The cases:
+
+- "cube": eight cameras around a cube with markers on its sides, of which each camera sees two at a time.
+- "groups": two groups of two cameras, which see the same cube one after the other.
+- "phones": six cameras with offsets of up to 60 s and rates of up to 1 % before one light, their lenses exact. The
+  figure of clocks is that of offsets and rates together.
+- "lenses": four cameras before a wand, lenses unknown by factors between 1/2 and 2; of each recording eight starts.
+
+Options: `--seeds N` recordings of each case (3), `--jobs N` processes (1), `--cases NAME ...`.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+from rich.console import Console
+
+from calib.errors import CalibrationError
+from calib.rig.camera import DRIFT, OFFSET
+from calib.wand.bundle_adjustment.covariance import camera_covariance
+from calib.wand.calibrate import calibrate
+from calib.wand.quality.grade import assess
+from calib.wand.quality.lenses import describe_open_lenses
+from calib.wand.wand_report import WandCalibration
+from camera_node.foundation.terminal import track
+from tests.benchmarks.calibration_honesty import (
+    LIGHT,
+    Outcome,
+    compute,
+    error_of_differences,
+    judge,
+    report,
+    without_lenses,
+)
+from tests.calib.cube import CUBE, one_after_the_other, wave
+from tests.calib.recordings import EPOCH_S, WandScenario, record, with_clocks
+from tests.calib.synthetic import CAREFUL, EXACT, WAND, ring, roughly
+
+STARTS = 8  # of each recording with unknown lenses
+SECONDS, RATE_HZ = 30.0, 20.0  # of a recording of phones, or with unknown lenses
+MIDDLE_NS = round(1e9 * (EPOCH_S + SECONDS / 2))
+MAX_OFFSET_S, MAX_RATE = 60.0, 0.01
+
+
+def cube(seed: int) -> Outcome:
+    """Forty simultaneous frames."""
+    arena = ring(8, wand=CUBE)
+    rig = roughly(arena.intrinsics, CAREFUL, with_sigma=True, seed=seed)
+    result = calibrate(rig, CUBE, wave(arena, 2, 40, seed), synchronous=True)
+    return judge("cube", seed, result, arena.truth)
+
+
+def groups(seed: int) -> Outcome:
+    """Two hundred frames of each camera, which run freely."""
+    arena, messages = one_after_the_other((2, 2), 200, seed)
+    rig = roughly(arena.intrinsics, CAREFUL, with_sigma=True, seed=seed)
+    return judge("groups", seed, calibrate(rig, CUBE, messages), arena.truth)
+
+
+def scenario(seed: int, **options: object) -> WandScenario:
+    """A recording of cameras that run freely."""
+    header = {"seconds": SECONDS, "rate_hz": RATE_HZ, "sigma_px": 0.2, "outliers": 0.02, "drift_ppm": 0.0}
+    seen = {"numbered": True, "sized": False, "both_sides": True}
+    return WandScenario(**{**header, **seen, "seed": seed, **options})
+
+
+def phones(seed: int) -> Outcome:
+    """Each clock has an offset and a rate; one is right."""
+    recorded = record(scenario(seed, cameras=6, wand=LIGHT, offset_ms=0.0))
+    names, rng = list(recorded.truth.cameras), np.random.default_rng([13, seed])
+    drawn = rng.uniform(-1, 1, (len(names), 2)) * [MAX_OFFSET_S, MAX_RATE]
+    drawn[0] = 0.0
+    clocks = dict(zip(names, drawn.tolist(), strict=True))
+    rig = roughly(recorded.intrinsics, EXACT, with_sigma=True)  # a light determines no lenses
+    result = calibrate(rig, LIGHT, with_clocks(recorded.messages, MIDDLE_NS, clocks))
+    outcome = judge("phones", seed, result, recorded.truth)
+    return msgspec.structs.replace(outcome, clocks=map_error(result, clocks), focal=None)
+
+
+def map_error(result: WandCalibration, clocks: dict[str, tuple[float, float]]) -> float:
+    """Squared Mahalanobis error of all offsets and rates, over its degrees of freedom; a common offset and a common
+    rate are not observable.
+
+    Args:
+        clocks: offset, s, and rate of each camera's stamps, as of `with_clocks`.
+    """
+    late = []
+    for name in result.names:
+        offset_s, rate = clocks[name]
+        stamps = [MIDDLE_NS + round(1e9 * (t_s * (1 + rate) + offset_s)) for t_s in (-1.0, 1.0)]
+        before, after = (
+            1e-9 * (result.rig.cameras[name].capture_ns(stamp) - MIDDLE_NS) - t_s
+            for stamp, t_s in zip(stamps, (-1.0, 1.0), strict=True)
+        )
+        late.append([(before + after) / 2, (after - before) / 2])
+    covariance = camera_covariance(result.adjusted).of(OFFSET + DRIFT)
+    common = np.tile(np.eye(2), (len(late), 1))
+    return error_of_differences(np.ravel(late), covariance.reshape(2 * len(late), -1), common)
+
+
+def lenses(seed: int) -> Outcome:
+    """Focal lengths start from another random factor in each camera."""
+    recorded = record(scenario(seed // STARTS, cameras=4, offset_ms=50.0))
+    result = calibrate(without_lenses(recorded.intrinsics, seed), WAND, recorded.messages)
+    outcome = judge("lenses", seed, result, recorded.truth)
+    return msgspec.structs.replace(outcome, fault=describe_open_lenses(assess(result, WAND).open_lenses))
+
+
+CASES: dict[str, Callable[[int], Outcome]] = {
+    "cube": cube,
+    "groups": groups,
+    "phones": phones,
+    "lenses": lenses,
+}
+
+
+def measure(case: str, seed: int) -> Outcome:
+    """The outcome of a case with a seed, or why it was refused."""
+    try:
+        return CASES[case](seed)
+    except CalibrationError as error:
+        return Outcome(case, seed, fault=str(error))
+
+
+def run(arguments: list[str]) -> None:
+    """Print a row for each case; figures outside of 0.6 to 1.6 are marked."""
+    parser = argparse.ArgumentParser(prog="tests.benchmarks.calibration acceptance")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
+    options = parser.parse_args(arguments)
+    start = time.monotonic()
+    count = {case: options.seeds * (STARTS if case == "lenses" else 1) for case in options.cases}
+    tasks = [(case, seed) for case, seeds in count.items() for seed in range(seeds)]
+    outcomes = list(track(compute(measure, tasks, options.jobs), "calibrating", len(tasks)))
+    report(sorted(outcomes, key=lambda outcome: tasks.index((outcome.cell, outcome.seed))))
+    Console().print(f"{len(tasks)} calibrations in {time.monotonic() - start:.0f} s")
