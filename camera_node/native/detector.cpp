@@ -67,14 +67,15 @@ FrameResult Detector::detect(const ImageView& image) {
     fit_moving_streaks(candidates.streaks, frame);
     const bool learned = decide(frame);
     // 5. Tracks, and what the next frame needs not search again.
-    tracks_.update(frame.found, frame.image);
+    tracks_.update(frame.found);
     if (paper_)
         update_theta(frame.found);
     else
         mark_searched(parts, frame.found);
-    // 6. What the roundels show of their prints and of the camera.
+    // 6. What the roundels show of their prints and of the camera, and their codes.
     if (!learned) observe(frame);
     for (TrackedFit& roundel : frame.found) camera_.claim(roundel.fit);
+    tracks_.read_codes(frame.found, frame.image);
     return {std::move(frame.found), n_postponed_};
 }
 
@@ -225,6 +226,14 @@ void Detector::fit_moving_streaks(const std::vector<Streak>& streaks, FrameState
 /// Whether the camera's response is all that shapes the levels of a roundel.
 static bool shows_camera(const RoundelFit& fit) { return fit.unoccluded && !fit.fields.has_light(); }
 
+/// The model of a picture whose levels are raised to a power: codes are read by it.
+static void raise_levels(RoundelFit& fit, double exponent) {
+    const double contrast = fit.p[kBright] - fit.p[kDark];
+    for (const Parameter level : {kBright, kDark, kGround})
+        fit.p[level] = 255 * std::pow(std::max(fit.p[level], 0.0) / 255, exponent);
+    fit.noise *= (fit.p[kBright] - fit.p[kDark]) / contrast;
+}
+
 /// Decides on the roundels that a camera's tone curve and processing may explain, before both are known: all
 /// roundels of the frame show them together. Returns whether it has learned from the frame.
 bool Detector::decide(FrameState& frame) {
@@ -234,8 +243,10 @@ bool Detector::decide(FrameState& frame) {
                                      [](const TrackedFit& roundel) { return shows_camera(roundel.fit); });
     const bool learns = size_t(shown) + frame.undecided.size() >= kMinWitnesses;
     if (learns) {
+        const double before = camera_.exponent_in_use();
         observe(frame);
         frame.image = camera_.linearize(frame.encoded);
+        for (TrackedFit& roundel : frame.found) raise_levels(roundel.fit, camera_.exponent_in_use() / before);
         frame.noise = noise_level(frame.image);
     }
     for (const RoundelFit& fit : frame.undecided)

@@ -70,17 +70,17 @@ void Tracks::forget_models() {
     for (Track& t : tracks_) t.steady = false;
 }
 
-void Tracks::update(std::vector<TrackedFit>& found, const ImageView& image) {
+void Tracks::update(std::vector<TrackedFit>& found) {
     std::vector<bool> taken(tracks_.size(), false);
     std::vector<Track> now;
     const auto continue_track = [&](TrackedFit& roundel, const Track& t) {
         taken[size_t(&t - tracks_.data())] = true;
         roundel.track = t.number;
         const double frames = t.missed + 1;
-        now.push_back({t.number, roundel.fit, (roundel.fit.outer.x - t.fit.outer.x) / frames,
+        now.push_back({t.number, size_t(&roundel - found.data()), roundel.fit,
+                       (roundel.fit.outer.x - t.fit.outer.x) / frames,
                        (roundel.fit.outer.y - t.fit.outer.y) / frames, 0,
                        roundel.fit.unoccluded && distance(t, roundel.fit) < kSteady, t.code});
-        roundel.code = now.back().code.add(image, roundel.fit);
     };
     for (TrackedFit& roundel : found)
         for (const Track& t : tracks_)
@@ -92,8 +92,7 @@ void Tracks::update(std::vector<TrackedFit>& found, const ImageView& image) {
         } else {
             roundel.track = next_;
             next_ = (next_ + 1) % kNumbers;
-            now.push_back({roundel.track, roundel.fit, 0, 0, 0, false});
-            roundel.code = now.back().code.add(image, roundel.fit);
+            now.push_back({roundel.track, size_t(&roundel - found.data()), roundel.fit, 0, 0, 0, false});
         }
     }
     for (size_t k = 0; k < tracks_.size(); ++k)
@@ -103,6 +102,11 @@ void Tracks::update(std::vector<TrackedFit>& found, const ImageView& image) {
             now.back().vx = now.back().vy = 0;  // unknown: a lost roundel is expected where it was last seen
         }
     tracks_.swap(now);
+}
+
+void Tracks::read_codes(std::vector<TrackedFit>& found, const ImageView& image) {
+    for (Track& t : tracks_)
+        if (!t.missed) found[t.row].code = t.code.add(image, found[t.row].fit);
 }
 
 }  // namespace roundel

@@ -35,16 +35,18 @@ class Tracks {
     std::vector<ExpectedRoundel> expect() const;
     /// The last ellipses of lost tracks that are not deleted yet.
     std::vector<Ellipse> lost() const;
-    /// Takes the roundels of a frame, and reads their codes in its image. A roundel without a number (below
-    /// 0) continues the nearest track that is predicted within a diameter, or starts a new one. A lost track
-    /// is deleted after 30 frames.
-    void update(std::vector<TrackedFit>& found, const ImageView& image);
+    /// Takes the roundels of a frame. A roundel without a number (below 0) continues the nearest track that is
+    /// predicted within a diameter, or starts a new one. A lost track is deleted after 30 frames.
+    void update(std::vector<TrackedFit>& found);
+    /// Reads the codes of the roundels of the last update in its image, with their final covariances.
+    void read_codes(std::vector<TrackedFit>& found, const ImageView& image);
     /// Lets the next fits start from rays, since the models of the last frame hold no longer.
     void forget_models();
 
   private:
     struct Track {
         int number;
+        size_t row;  // among the roundels of the last frame, unless it was missed
         RoundelFit fit;
         double vx;   // pixels per frame
         double vy;   // pixels per frame

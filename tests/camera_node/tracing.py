@@ -86,7 +86,7 @@ def pixels_across(lens: Lens, diameter_m: float, px: float) -> float:
 def trace(sight: Sight, pieces: int = 6) -> Array:
     """Grey levels (h, w) of the image of `sight.lens`, without noise, from `pieces` squared samples per pixel."""
     margin = int(np.ceil(4 * sight.blur)) + 1
-    points = _trace_points(sight, margin, pieces)
+    points = plane_points(sight, margin, pieces)
     radius = np.hypot(points[..., 0], points[..., 1])
     card, black, white = (_part(radius, r) for r in (sight.card, 1.0, sight.ratio))
     if sight.code:
@@ -110,7 +110,7 @@ def _code(sight: Sight, points: Array, radius: Array) -> Array:
     )
 
 
-def _trace_points(sight: Sight, margin: int, pieces: int) -> Array:
+def plane_points(sight: Sight, margin: int, pieces: int) -> Array:
     """(h, w, 2) points of the print, in outer radii, at each sample, with one more sample on every side.
 
     The first axis is the direction of the image's rows in the print's plane, the second one is a quarter turn from it,

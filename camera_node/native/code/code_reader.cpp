@@ -26,6 +26,7 @@ constexpr double kChanged = 1e-3;           // and that a track has become anoth
 constexpr double kModelError = 0.1;         // of a sector's level, contrasts
 constexpr double kRemembered = 10;          // frames of a mean: errors of fits differ from frame to frame
 constexpr float kImpossible = -1e9f;        // a log-likelihood
+constexpr int kMaxEdges = 12;               // of a word between ink and paper
 constexpr double kInterpolation = 1 / 6.0;  // variance that bilinear interpolation adds to blur, px^2
 
 /// Directions counter-clockwise as seen in front of the print: those of the sectors' starts, and turns by
@@ -169,27 +170,44 @@ struct SectorScores {
     float black[kCodeSectors + kPadded];  // what each sector adds if it is black, twice around
 };
 
+/// A tone curve of curvature kappa, which brightens the levels s between ink and paper by kappa s (1 - s),
+/// shows ink of which blur leaves the share 1 / gain paler by kappa (1 - 1 / gain). Least squares for kappa,
+/// with its prior, over the sectors that are rather black; `sigma` is that of a level, contrasts.
+ROUNDEL_INLINE float find_curvature(const Profile& profile, const SectorLevels& sectors, float per_sigma) {
+    Lanes paleness{}, information{};
+    for (int k = 0; k < kPadded; k += kLanes) {
+        const Lanes per_gain = 1.0f / load(profile.gains.at + k), weight = per_sigma * per_gain;
+        const Lanes level = load(sectors.black.at + k) / (float(profile.per_sector) / 2);
+        const Lanes by_curvature = level > 0.5f ? weight * (1.0f - per_gain) : all(0);
+        paleness += level > 0.5f ? by_curvature * weight * (1.0f - level) : all(0);
+        information += by_curvature * by_curvature;
+    }
+    return sum(paleness) / (sum(information) + 1 / float(square(kCurvaturePrior)));
+}
+
 /// `sigma` is that of a level, contrasts. Without a code, all levels within half a contrast of ink and paper
 /// are alike.
 ROUNDEL_CLONES void score(const Profile& profile, const SectorLevels& sectors, double sigma,
                           SectorScores& to) {
     const auto due = float(std::log((1 - kCovered) * 2 / (std::sqrt(kTau) * sigma)));
     const auto covered = float(std::log(kCovered)), per_sigma = float(1 / sigma);
+    const float curvature = find_curvature(profile, sectors, per_sigma);
+    const auto improbable = float(square(double(curvature) / kCurvaturePrior) / 2);
     Lanes white_ring{}, most{};
     for (int k = 0; k < kPadded; k += kLanes) {
-        const Lanes per_gain = per_sigma / load(profile.gains.at + k);
+        const Lanes left = 1.0f / load(profile.gains.at + k), per_gain = per_sigma * left;
         const Lanes level = load(sectors.black.at + k) / (float(profile.per_sector) / 2);
-        const auto log_likelihood = [&](float expected) __attribute__((always_inline)) {
+        const auto log_likelihood = [&](const Lanes& expected) __attribute__((always_inline)) {
             const Lanes off = (level - expected) * per_gain, agreeing = due - 0.5f * off * off;
             return level == level ? log_sum(agreeing, all(covered)) : all(0);
         };
-        const Lanes white = log_likelihood(0), black = log_likelihood(1);
+        const Lanes white = log_likelihood(all(0)), black = log_likelihood(1.0f - curvature * (1.0f - left));
         store(to.black + k, black - white);
         white_ring += white;
         most += greater(white, black);
     }
-    to.most = sum(most);
-    to.white = sum(white_ring);
+    to.most = sum(most) - improbable;
+    to.white = sum(white_ring) - improbable;
     for (int k = kCodeSectors; k < kCodeSectors + kPadded; ++k) to.black[k] = to.black[k - kCodeSectors];
 }
 
@@ -262,47 +280,112 @@ int best_turn(const SectorScores& sectors, Word word) {
     return int(std::max_element(sums, sums + kCodeSectors) - sums);
 }
 
-/// The angle from the first sample's side to the zero of a word, and its variance, radians.
+/// The angle from the first sample's side to the zero of a word as the fit shows it, and its variance,
+/// radians.
 struct Zero {
     double angle, variance;
 };
 
-/// Least squares over the edges between ink and paper. Unknowns: an error of the levels, which displaces both
-/// kinds of edges in opposite directions; the displacement of the ring's centre, of which the fit has the
-/// variance `centre` in radians of the ring; the lateness of the zero. Lengths are in samples.
-Zero find_zero(const Profile& profile, int start, Word seen, int turn, double noise, double centre) {
-    constexpr int kUnknowns = 4;
+/// How errors of the fit displace a direction in its frame: derivatives of the angle by Axx, Axy, Ayy and the
+/// offset of the disc's centre, as in `PoseCovariance`.
+constexpr int kFitErrors = 5;
+Vector<kFitErrors> angle_by_fit(const Parameters& p, double x, double y, double radius) {
+    const double det = p[kAxx] * p[kAyy] - p[kAxy] * p[kAxy];
+    const double u = (p[kAyy] * y + p[kAxy] * x) / det, v = -(p[kAxy] * y + p[kAxx] * x) / det;
+    return {u * x, u * y + v * x, v * y, u / radius, v / radius};
+}
+
+/// How much of a neighbouring edge the sum between two middles contains, in sectors: the tail of a blurred
+/// edge beyond half a sector.
+double leak(double blur) {
+    const double z = 0.5 / blur;
+    return blur * (std::exp(-z * z / 2) / std::sqrt(kTau) - z / 2 * std::erfc(z / std::numbers::sqrt2));
+}
+
+/// The edges between ink and paper: how late each one is, and the covariance of that. Rows beyond the last
+/// edge are independent of all others.
+struct LateEdges {
+    int count = 0;
+    Vector<kMaxEdges> late{}, ones{};
+    Vector<kMaxEdges> with_zero{};  // covariances with the fit's error at the zero
+    std::array<Vector<kMaxEdges>, kMaxEdges> V{};
+};
+
+/// Each edge has the noise of its pixels. An error of the levels, which displaces both kinds of edges in
+/// opposite directions, and the errors of the fit displace all of them.
+LateEdges measure_edges(const Profile& profile, int start, Word seen, double noise, const RoundelFit& fit,
+                        const Vector<kFitErrors>& of_zero) {
     const int m = profile.per_sector;
-    const double step = kTau / (m * kCodeSectors), prior = m * square(noise) * square(step) / centre;
-    std::array<Vector<kUnknowns>, kUnknowns> H{};
-    Vector<kUnknowns> right{};
-    double squares = 0, gain = 0;
-    int edges = 0;
-    H[1][1] = H[2][2] = prior;
-    for (int k = 0; k < kCodeSectors; ++k) {
-        const bool before = seen >> k & 1, after = seen >> ((k + 1) % kCodeSectors) & 1;
+    const double step = kTau / (m * kCodeSectors), level = kModelError * m * step;
+    const double spread = std::sqrt(square(fit.p[kBlur]) + kInterpolation);
+    const auto black_at = [&](int k) { return int(seen >> (k % kCodeSectors) & 1); };
+    LateEdges edges;
+    std::array<Vector<kFitErrors>, kMaxEdges> J;
+    Vector<kMaxEdges> sign;
+    for (int k = 0; k < kCodeSectors && edges.count < kMaxEdges; ++k) {
+        const int before = black_at(k), after = black_at(k + 1);
         if (before == after) continue;
         const double black = profile.between(k, start);
         if (!std::isfinite(black)) continue;
-        const double late = before ? black - m / 2.0 : m / 2.0 - black;
         const auto [x, y] = kAround.at(k + 1, 2 * start * kFinest / m);
-        const Vector<kUnknowns> J{before ? 1.0 : -1.0, double(x), double(-y), 1};
-        for (size_t i = 0; i < kUnknowns; ++i) {
-            right[i] += J[i] * late;
-            for (size_t j = 0; j <= i; ++j) H[i][j] += J[i] * J[j];
-        }
-        squares += late * late;
-        gain += square(double(profile.gains.at[k]));
-        ++edges;
+        const Parameters& p = fit.p;
+        const double pixels =
+            kMiddle * kTau / kCodeSectors *
+            std::hypot(p[kAxx] * double(y) - p[kAxy] * double(x), p[kAxy] * double(y) - p[kAyy] * double(x));
+        const int next = after != black_at(k + 2), last = before != black_at(k + kCodeSectors - 1);
+        const auto row = size_t(edges.count++);
+        sign[row] = before ? 1 : -1;
+        edges.ones[row] = 1;
+        edges.late[row] = step * (sign[row] * (black - m / 2.0) - m * leak(spread / pixels) * (next - last));
+        // Along a line, pixels interpolated bilinearly have 2/3 of the variance of one pixel a pixel; samples
+        // that are farther apart have 4/9 each.
+        const double samples = m * 2 / 3.0 * std::max(m / pixels, 2 / 3.0);
+        edges.V[row][row] = samples * square(step * noise * double(profile.gains.at[k])) * fit.correlation;
+        J[row] = angle_by_fit(p, double(x), double(y), kMiddle);
     }
-    const Cholesky<kUnknowns> factor(H);
-    if (!factor.positive()) return {0, INFINITY};
-    const Vector<kUnknowns> x = factor.solve(right);
-    for (size_t i = 0; i < kUnknowns; ++i) squares -= right[i] * x[i];
-    // Both edges of an arc are wrong together where compression or blur displaces it: they count as one.
-    const double variance =
-        2 * std::max(m * square(noise) * gain / edges, squares / std::max(1, edges - kUnknowns));
-    return {step * (start + turn * m + x[3]), square(step) * variance * factor.inverse_tail<1>()[0][0]};
+    for (size_t i = 0; i < kMaxEdges; ++i) {
+        if (i >= size_t(edges.count)) {
+            edges.V[i][i] = 1;
+            continue;
+        }
+        Vector<kFitErrors> with_fit{};
+        for (size_t a = 0; a < kFitErrors; ++a)
+            for (size_t b = 0; b < kFitErrors; ++b) with_fit[a] += fit.pose_cov[2 + a][2 + b] * J[i][b];
+        for (size_t j = 0; j <= i; ++j) {
+            edges.V[i][j] += sign[i] * sign[j] * square(level);
+            for (size_t a = 0; a < kFitErrors; ++a) edges.V[i][j] += with_fit[a] * J[j][a];
+        }
+        for (size_t a = 0; a < kFitErrors; ++a) edges.with_zero[i] += with_fit[a] * of_zero[a];
+    }
+    return edges;
+}
+
+double product(const Vector<kMaxEdges>& a, const Vector<kMaxEdges>& b) {
+    double sum = 0;
+    for (size_t k = 0; k < kMaxEdges; ++k) sum += a[k] * b[k];
+    return sum;
+}
+
+/// Generalized least squares (Aitken 1935) for the turn, and the error of the fit at the zero as the edges
+/// predict it (Goldberger 1962). Where residuals exceed the claims, the variance grows with them; by
+/// chi-square / (n - 3) in place of (n - 1), so that the mean squared error over the claim is 1.
+Zero find_zero(const Profile& profile, int start, Word seen, int turn, double noise, const RoundelFit& fit) {
+    const double at = kTau / kCodeSectors * (turn + double(start) / profile.per_sector);
+    Vector<kFitErrors> of_zero = angle_by_fit(fit.p, std::cos(at), -std::sin(at), 1);
+    of_zero[0] = of_zero[1] = of_zero[2] = 0;  // the published angle is that on the outline
+    const LateEdges edges = measure_edges(profile, start, seen, noise, fit, of_zero);
+    const Cholesky<kMaxEdges> factor(edges.V);
+    if (edges.count <= 3 || !factor.positive()) return {NAN, NAN};
+    const Vector<kMaxEdges> ones = factor.halfway(edges.ones), with_zero = factor.halfway(edges.with_zero);
+    Vector<kMaxEdges> residual = factor.halfway(edges.late);
+    const double information = product(ones, ones), late = product(ones, residual) / information;
+    for (size_t k = 0; k < kMaxEdges; ++k) residual[k] -= late * ones[k];
+    const double excess = std::max(1.0, product(residual, residual) / (edges.count - 3));
+    double variance = square(1 - product(ones, with_zero)) / information - product(with_zero, with_zero);
+    for (size_t a = 3; a < kFitErrors; ++a)
+        for (size_t b = 3; b < kFitErrors; ++b)
+            variance += of_zero[a] * fit.pose_cov[2 + a][2 + b] * of_zero[b];
+    return {at + late + product(with_zero, residual), excess * variance};
 }
 
 /// The place on the outer ellipse of the point of the outer circle at an angle.
@@ -341,13 +424,9 @@ CodeReading CodeTrack::add(const ImageView& image, const RoundelFit& fit) {
     if (!(others < kMaxError)) return {};
     const int name = int(best) + 1;
     if (codes[best] < 0) return {name, 1 / (1 + others), NAN, NAN};  // covered
-    // The fit measures the offset of the disc's centre; that of the ring's centre is as large relative to it.
-    const Symmetric offset = fit.offset_covariance();
-    const double centre = (offset.xx + offset.yy) / (2 * fit.outer.major * fit.outer.minor / 4) *
-                          square((square(kMiddle) - 1) / kMiddle);
     const Word word = code_words()[best];
     const int turn = best_turn(scores, word);
-    const Zero zero = find_zero(profile, sectors.start, turned(word, turn), turn, noise, centre);
+    const Zero zero = find_zero(profile, sectors.start, turned(word, turn), turn, noise, fit);
     return {name, 1 / (1 + others), on_ellipse(fit.p, zero.angle), std::sqrt(zero.variance)};
 }
 

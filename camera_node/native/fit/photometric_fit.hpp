@@ -20,6 +20,7 @@ namespace roundel {
 /// s = Phi(x), the least squares fit of a shift to s (1 - s): the integral of s (1 - s) ds, 1 / 6, over that
 /// of phi(x)^2 dx, 1 / (2 sqrt(pi)).
 constexpr double kEdgeShift = 0.5908179503;
+constexpr double kCurvaturePrior = 0.6;  // standard deviation of that curvature; 0.7 is a gamma of 2.2
 
 constexpr double kInitialBlur = 0.8;  // pixels: of a guess, before the fit
 

@@ -194,7 +194,8 @@ void CameraModel::forget() {
 }
 
 void CameraModel::claim(RoundelFit& fit) const {
-    fit.pose_cov = scaled(fit.pose_cov, std::max({1.0, fit.correlation, correlation_.value()}));
+    fit.correlation = std::max({1.0, fit.correlation, correlation_.value()});
+    fit.pose_cov = scaled(fit.pose_cov, fit.correlation);
     // Clipped paper hides the part of an edge that would show the tone curve: its prior stays.
     const double unknown = fit.clipped && !knows_tone_ ? square(kCurvaturePrior) : 0;
     fit.widen_size(std::max(surprise_, unknown) * square(kEdgeShift * fit.blur));

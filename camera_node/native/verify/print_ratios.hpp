@@ -9,8 +9,6 @@
 
 namespace roundel {
 
-constexpr double kCurvaturePrior = 0.6;  // standard deviation of a tone curve's; 0.7 is a gamma of 2.2
-
 inline double ratio_by_curvature(const RoundelFit& fit, double print_ratio) {
     return ratio_by_curvature(fit.outer, print_ratio, fit.blur);
 }

@@ -80,11 +80,15 @@ class Second:
         return self._expose([], rng)
 
     def _expose(self, prints: list[Print], rng: np.random.Generator) -> Grey:
+        return self.camera.expose(self.light_of(prints, rng), rng)
+
+    def light_of(self, prints: list[Print], rng: np.random.Generator) -> Array:
+        """The light (h, w) of prints on a ground that it draws, levels of 255."""
         there = scene.Scene.draw(self.grounds[rng.integers(len(self.grounds))], self.coma, rng)
         light = self.gain * scene.render(there, prints, self.light, rng)
         for card in prints if self.cover else []:
             occlude(light, Card(card.uv, card.diameter), self.cover, rng.uniform(-1, 1), rng)
-        return self.camera.expose(light, rng)
+        return light
 
     def acquaint(self, run: Run) -> Detector:
         """A detector that has seen three pictures of this camera, and tracks nothing."""

@@ -2,7 +2,8 @@
 """Where a print is seen: its homography, the conic of its outline, curled paper, and exact coverage of a raster.
 
 Lengths in the print's plane are in outer radii. The ring has the print's definition and nothing else: outer radius 1,
-inner radius `inner_ratio` (0.6 unless another is given), card `surround_ratio` (`camera_node/geometry/body.py`).
+inner radius `inner_ratio` (0.6 unless another is given), card `surround_ratio` (`camera_node/geometry/body.py`), and
+black arcs of its code (`camera_node/geometry/codes.py`).
 """
 
 from dataclasses import dataclass
@@ -10,13 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.foundation.arrays import Array
+from camera_node.geometry import codes
 
 FOCAL = 600.0  # pixels
 SIZE = (480, 640)
 INNER, CARD = 0.6, 9 / 7
 K = np.array([[FOCAL, 0, (SIZE[1] - 1) / 2], [0, FOCAL, (SIZE[0] - 1) / 2], [0, 0, 1]])
 POINTS = 2048  # of a circle: they lie less than 1e-4 px from it up to 60 px
+CELLS = 40  # of a half-tone across a disc: 85 lines an inch, as in newspapers, on a disc of 12 mm
+INKED = 0.85  # share of a half-tone
 APEX = 1.6  # distance of the apex of curled paper from the disc's centre, card radii
+GRID = np.cos(np.linspace(-np.pi, np.pi, 400, endpoint=False))
+BARE = float(np.quantile(GRID[:, None] + GRID, INKED))
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,10 @@ class Print:
         curl: height of the cone above the tangent plane at a card's radius from its axis, over the card's diameter;
             `axis` the direction of the cone's axis in the plane, radians.
         ratio: of the hole's and the disc's diameter.
+        card: radius of the card.
+        code: number of the code around the disc, 0 for none; its zero is at `spin` radians from the first axis.
+        dot_gain: by which every edge of the ink lies farther out than it should.
+        screened: whether the ink is a half-tone.
     """
 
     uv: tuple[float, float]
@@ -41,6 +51,11 @@ class Print:
     curl: float = 0.0
     axis: float = 0.0
     ratio: float = INNER
+    card: float = CARD
+    code: int = codes.PLAIN
+    spin: float = 0.0
+    dot_gain: float = 0.0
+    screened: bool = False
 
     @property
     def centre(self) -> Array:
@@ -66,11 +81,24 @@ class Print:
 
     def ellipse(self, radius: float = 1.0) -> tuple[Array, Array]:
         """Centre (2,) and full axes (2,), pixels, of a flat circle, from the conic H^-T diag(1, 1, -r^2) H^-1."""
+        centre, form = self._outline(radius)
+        return centre, 2 / np.sqrt(np.linalg.eigvalsh(form))
+
+    @property
+    def rotation(self) -> float:
+        """`Roundel.rotation_rad` of the code's zero on the true outline of the disc."""
+        centre, form = self._outline(1.0)
+        values, axes = np.linalg.eigh(form)
+        zero = self.image_of(np.array([[np.cos(self.spin), np.sin(self.spin)]]))[0]
+        u, v = (axes * np.sqrt(values)) @ axes.T @ (zero - centre)
+        return float(np.arctan2(v, u))
+
+    def _outline(self, radius: float) -> tuple[Array, Array]:
+        """Centre (2,) of the ellipse of a circle, and (2, 2) the form that is 1 on it."""
         back = np.linalg.inv(self.homography)
         conic = back.T @ np.diag([1.0, 1.0, -(radius**2)]) @ back
         centre = np.asarray(np.linalg.solve(conic[:2, :2], -conic[:2, 2]), float)
-        level = -(conic[2, 2] + conic[:2, 2] @ centre)
-        return centre, 2 * np.sqrt(level / np.linalg.eigvalsh(conic[:2, :2]))
+        return centre, conic[:2, :2] / -(conic[2, 2] + conic[:2, 2] @ centre)
 
     def image_of(self, plane: Array) -> Array:
         """Pixels (N, 2) of points (N, 2) of the print, on curled paper if it is curled."""
@@ -91,10 +119,27 @@ class Print:
     @property
     def outlines(self) -> tuple[Array, Array, Array]:
         """Polygons (N, 2), pixels: the card, the black disc and the hole."""
-        angle = np.linspace(0, 2 * np.pi, POINTS, endpoint=False)
-        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        circle = _arc(np.linspace(0, 2 * np.pi, POINTS, endpoint=False))
         card = circle / np.abs(circle).max(axis=1, keepdims=True) if self.square else circle
-        return self.image_of(CARD * card), self.image_of(circle), self.image_of(self.ratio * circle)
+        radii = 1 + self.dot_gain, self.ratio - self.dot_gain
+        black, hole = (self.image_of(r * circle) for r in radii)
+        return self.image_of(self.card * card), black, hole
+
+    @property
+    def ticks(self) -> list[Array]:
+        """Polygons (N, 2), pixels: the black arcs of the code."""
+        inner, outer = codes.INNER - self.dot_gain, codes.OUTER + self.dot_gain
+        share, polygons = np.linspace(0, 1, POINTS // codes.SECTORS), []
+        for start, end in codes.arcs(self.code) if self.code else ():
+            angle = [
+                self.spin + start - self.dot_gain / r + share * (end - start + 2 * self.dot_gain / r)
+                for r in (inner, outer)
+            ]
+            along = (inner + share * (outer - inner))[:, None]
+            far, near = outer * _arc(angle[1]), inner * _arc(angle[0][::-1])
+            sides = along[::-1] * _arc(angle[1][-1:]), along * _arc(angle[0][:1])
+            polygons.append(self.image_of(np.concatenate([far, sides[0], near, sides[1]])))
+        return polygons
 
     @property
     def _height(self) -> float:
@@ -104,6 +149,17 @@ class Print:
         """Coordinates along and across the cone's axis."""
         c, s = np.cos(self.axis), np.sin(self.axis)
         return plane @ [c, s], plane @ [-s, c]
+
+
+def _arc(angle: Array) -> Array:
+    """Points (N, 2) of the unit circle."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def screen(plane: Array) -> Array:
+    """Whether points (N, 2) of the plane are bare in a half-tone: round holes on a grid at 45 degrees."""
+    across = 2 * np.pi * CELLS / 2 * (plane @ np.array([[1, 1], [1, -1]]) / np.sqrt(2))
+    return np.cos(across).sum(axis=1) > BARE
 
 
 def coverage(polygon: Array, shape: tuple[int, int]) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array
 from tests.benchmarks.detector.second.optics import REACH, Lens, blur, centroid_of
-from tests.benchmarks.detector.second.print_geometry import CARD, INNER, SIZE, Print, coverage
+from tests.benchmarks.detector.second.print_geometry import CARD, INNER, SIZE, Print, coverage, screen
 from tests.benchmarks.detector.second.surroundings import (
     EVEN,
     Ground,
@@ -24,6 +24,7 @@ from tests.benchmarks.detector.second.surroundings import (
 )
 
 PIECES = 4  # samples per pixel in either direction
+FINEST = 3  # samples of a half-tone per sample, in either direction
 COLUMNS, ROWS = 5, 4
 PART = (SIZE[0] // ROWS, SIZE[1] // COLUMNS)
 WIDE = (SIZE[0] + 2 * REACH, SIZE[1] + 2 * REACH)  # what the margins of all parts cover
@@ -139,9 +140,14 @@ def _show(
     """The fine raster (h, w) with a print and the light on it."""
     h, w = ground.shape
     origin = np.array([corner[1] - REACH - 0.5, corner[0] - REACH - 0.5])
-    whole, black, hole = (coverage((line - origin) * PIECES, (h, w)) for line in card.outlines)
-    paper = levels.paper * (whole - black + hole) + levels.ink * (black - hole)
-    paper = paper * lit
+    whole, black, hole, *ticks = (
+        coverage((line - origin) * PIECES, (h, w)) for line in (*card.outlines, *card.ticks)
+    )
+    ink = black - hole + sum(ticks)
+    if card.screened:
+        inked = np.nonzero(ink)
+        ink[inked] *= 1 - _bare(card, np.stack(inked[::-1], axis=1), origin)
+    paper = (levels.paper * (whole - ink) + levels.ink * ink) * lit
     if light == "room" and not card.curl:
         return ground * (1 - whole) + paper
     plane = _plane(card, (h, w), origin)
@@ -155,10 +161,23 @@ def _show(
     return out
 
 
+def _bare(card: Print, samples: Array, origin: Array) -> Array:
+    """The share (N,) of samples (N, 2), columns and rows of the raster, that a half-tone leaves without ink."""
+    part = (np.arange(FINEST) + 0.5) / FINEST
+    at = samples[:, None] + np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2)
+    return (
+        screen(_unproject(card, at.reshape(-1, 2) / PIECES + origin)).reshape(len(samples), -1).mean(axis=1)
+    )
+
+
 def _plane(card: Print, shape: tuple[int, int], origin: Array) -> Array:
     """Where the samples (h, w) of a part see the plane of the flat print, (h w, 2)."""
     y, x = np.mgrid[: shape[0], : shape[1]]
-    pixels = (np.stack([x.ravel(), y.ravel()], axis=1) + 0.5) / PIECES + origin
+    return _unproject(card, (np.stack([x.ravel(), y.ravel()], axis=1) + 0.5) / PIECES + origin)
+
+
+def _unproject(card: Print, pixels: Array) -> Array:
+    """Where pixels (N, 2) see the plane of the flat print, (N, 2)."""
     seen = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(card.homography).T
     return seen[:, :2] / seen[:, 2:]
 
