@@ -35,8 +35,8 @@ class Tracks {
     std::vector<ExpectedRoundel> expect() const;
     /// The last ellipses of lost tracks that are not deleted yet.
     std::vector<Ellipse> lost() const;
-    /// Takes the roundels of a frame. A roundel without a number (below 0) continues the nearest track that is
-    /// predicted within a diameter, or starts a new one. A lost track is deleted after 30 frames.
+    /// Takes the roundels of a frame. A roundel without a number (below 0) continues the nearest track that
+    /// is predicted within a diameter, or starts a new one. A lost track is deleted after 30 frames.
     void update(std::vector<TrackedFit>& found);
     /// Reads the codes of the roundels of the last update in its image, with their final covariances.
     void read_codes(std::vector<TrackedFit>& found, const ImageView& image);

@@ -10,7 +10,9 @@ from camera_node.detection.detector import Detector
 from camera_node.detection.roundels import DetectedRoundels
 from camera_node.foundation.arrays import Grey, Index
 from camera_node.geometry import codes
+from camera_node.simulation.sensor import Sensor
 from tests.benchmarks.detector.pictures import Card, dead_leaves, expose, flat, grid, paste, rotation_of
+from tests.benchmarks.detector.recall import occlude
 
 SIZE = (300, 400)
 
@@ -52,6 +54,19 @@ def test_one_frame_names_and_turns_cards(diameter: float, tilt: float):
     error = (error + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(error).max() < codes.STEP / 4
     assert np.mean((error / found.rotation_sigma[rows]) ** 2) < 3
+
+
+def test_a_tone_curve_that_one_picture_shows_hides_no_name():
+    """Covered roundels are decided in the linearized picture, after the fits of the others: these have other levels."""
+    rng = np.random.default_rng(9)
+    places = grid(30, SIZE, rng)
+    shown = [replace(card, uv=uv) for card, uv in zip(cards(20, 20.0, 0.3, 9), places[:20], strict=True)]
+    plain = [Card(uv, 24.0) for uv in places[20:]]
+    light = paste(flat(SIZE, 90.0), [*shown, *plain])
+    for card in plain:
+        occlude(light, card, 0.2, 0.5, rng)
+    found = Detector().detect(Sensor(noise=0.5, tone="gamma").expose(light, rng))
+    assert found.id[rows_of(found, shown)].tolist() == [card.code for card in shown]
 
 
 def test_mirrored_codes_have_no_name():

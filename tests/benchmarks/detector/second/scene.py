@@ -146,7 +146,7 @@ def _show(
     ink = black - hole + sum(ticks)
     if card.screened:
         inked = np.nonzero(ink)
-        ink[inked] *= 1 - _bare(card, np.stack(inked[::-1], axis=1), origin)
+        ink[inked] *= 1 - _bare(card, np.stack(inked[::-1], axis=1).astype(float), origin)
     paper = (levels.paper * (whole - ink) + levels.ink * ink) * lit
     if light == "room" and not card.curl:
         return ground * (1 - whole) + paper
