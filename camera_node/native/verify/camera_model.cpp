@@ -148,7 +148,7 @@ void CameraModel::learn_remainder(const std::vector<ToneSample>& samples) {
 
 void CameraModel::learn_edge_noise(const std::vector<const RoundelFit*>& fits) {
     if (fits.empty()) return;
-    const auto median = [&](double RoundelFit::*of) {
+    const auto median = [&](auto of) {
         std::vector<double> values;
         for (const RoundelFit* fit : fits) values.push_back(fit->*of);
         return median_of(values);
