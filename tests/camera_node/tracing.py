@@ -85,33 +85,52 @@ def pixels_across(lens: Lens, diameter_m: float, px: float) -> float:
 
 def trace(sight: Sight, pieces: int = 6) -> Array:
     """Grey levels (h, w) of the image of `sight.lens`, without noise, from `pieces` squared samples per pixel."""
-    margin = int(np.ceil(4 * sight.blur)) + 1
-    points = plane_points(sight, margin, pieces)
-    radius = np.hypot(points[..., 0], points[..., 1])
-    card, black, white = (_part(radius, r) for r in (sight.card, 1.0, sight.ratio))
-    if sight.code:
-        black = black + _code(sight, points, radius)
-    fine = sight.ground + (sight.bright - sight.ground) * card - (sight.bright - sight.dark) * (black - white)
+    card, ink = _cover(sight, pieces)
+    fine = sight.ground + (sight.bright - sight.ground) * card - (sight.bright - sight.dark) * ink
+    return _to_pixels(fine, sight, pieces)
+
+
+def trace_card(sight: Sight, pieces: int = 6) -> tuple[Array, Array]:
+    """The light (h, w) of the card alone, and its coverage of each pixel; otherwise as `trace`."""
+    card, ink = _cover(sight, pieces)
+    light = sight.bright * card - (sight.bright - sight.dark) * ink
+    return _to_pixels(light, sight, pieces), _to_pixels(card, sight, pieces)
+
+
+def _to_pixels(fine: Array, sight: Sight, pieces: int) -> Array:
+    """Blur samples, and average those of each pixel."""
     if sight.blur:
-        fine = cv2.GaussianBlur(fine, (0, 0), sight.blur * pieces, borderType=cv2.BORDER_REPLICATE)
+        blurred = cv2.GaussianBlur(fine, (0, 0), sight.blur * pieces, borderType=cv2.BORDER_REPLICATE)
+        fine = np.asarray(blurred, float)
     h, w = fine.shape[0] // pieces, fine.shape[1] // pieces
+    margin = _margin(sight)
     whole = fine.reshape(h, pieces, w, pieces).mean(axis=(1, 3))
     return whole[margin : h - margin, margin : w - margin]
 
 
-def _code(sight: Sight, points: Array, radius: Array) -> Array:
-    """The coverage of each sample by the black sectors of the code."""
-    inner, outer = sight.ring
-    ring = _part(radius, outer) - _part(radius, inner)
-    angle = np.arctan2(points[1:-1, 1:-1, 1], points[1:-1, 1:-1, 0]) - sight.spin
-    cell = np.abs(radius[1:-1, 2:] - radius[1:-1, :-2]), np.abs(radius[2:, 1:-1] - radius[:-2, 1:-1])
-    return ring * codes.black_share(
-        sight.code, angle, np.hypot(*cell) / 2 / np.maximum(radius[1:-1, 1:-1], 0.1)
-    )
+def _cover(sight: Sight, pieces: int) -> tuple[Array, Array]:
+    """The coverage of each sample by the card, and by ink: it falls from 1 to 0 over one sample at an edge."""
+    x, y = plane_points(sight, _margin(sight), pieces)
+    radius = np.hypot(x, y)
+    inside = radius[1:-1, 1:-1]
+    across = np.abs(radius[1:-1, 2:] - radius[1:-1, :-2])
+    down = np.abs(radius[2:, 1:-1] - radius[:-2, 1:-1])
+    width = np.maximum(across, down) / 2 + 1e-12
+
+    def part(edge: float) -> Array:
+        return np.clip(0.5 + (edge - inside) / width, 0, 1)
+
+    ink = part(1.0) - part(sight.ratio)
+    if sight.code:
+        inner, outer = sight.ring
+        angle = np.arctan2(y[1:-1, 1:-1], x[1:-1, 1:-1]) - sight.spin
+        cell = np.hypot(across, down) / 2 / np.maximum(inside, 0.1)
+        ink += (part(outer) - part(inner)) * codes.black_share(sight.code, angle, cell)
+    return part(sight.card), ink
 
 
 def plane_points(sight: Sight, margin: int, pieces: int) -> Array:
-    """(h, w, 2) points of the print, in outer radii, at each sample, with one more sample on every side.
+    """(2, h, w) points of the print, in outer radii, at each sample, with one more sample on every side.
 
     The first axis is the direction of the image's rows in the print's plane, the second one is a quarter turn from it,
     counter-clockwise as seen in front of the print. Bent paper is taken from above.
@@ -119,37 +138,40 @@ def plane_points(sight: Sight, margin: int, pieces: int) -> Array:
     lens = sight.lens
     u, v = (_pieces(n, margin, pieces) for n in (lens.width, lens.height))
     if lens.distortion:
-        xy = lens.normalise(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)).reshape(len(v), len(u), 2)
+        x, y = lens.normalise(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)).T.reshape(2, len(v), len(u))
     else:
-        xy = np.stack(np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy), -1)
+        x, y = (u[None] - lens.cx) / lens.fx, (v[:, None] - lens.cy) / lens.fy
     n, c = sight.normal, sight.position
     first = np.array([1.0, 0.0, 0.0]) - n[0] * n
     axes = np.array([first, np.cross(n, first)]) / np.linalg.norm(first)
-    rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2)
-    return np.asarray((_depth(xy, sight)[..., None] * rays - c) @ axes.T, float) / (sight.diameter_m / 2)
+    depth = _depth(x, y, sight)
+    return np.stack([depth * _along(axis, x, y) - c @ axis for axis in axes]) / (sight.diameter_m / 2)
 
 
-def _depth(xy: Array, sight: Sight) -> Array:
-    """Depth at which rays (..., 2) meet the paper; a bent one's height falls with the square of a coordinate."""
+def _along(axis: Array, x: Array, y: Array) -> Array:
+    """The component along an axis (3,) of rays through points x, y of the plane at distance one."""
+    return axis[0] * x + axis[1] * y + axis[2]
+
+
+def _depth(x: Array, y: Array, sight: Sight) -> Array:
+    """Depth at which these rays meet the paper; a bent one's height falls with the square of a coordinate."""
     n, c, half = sight.normal, sight.position, sight.diameter_m * sight.card / 2
     along = np.cross(n, [0.0, 1.0, 0.0])
     along /= np.linalg.norm(along)
-    slope, depth = xy @ n[:2] + n[2], np.zeros(())
+    slope, depth = _along(n, x, y), np.zeros(())
     for _ in range(5 if sight.bend else 1):
-        s = (xy @ along[:2] + along[2]) * depth - c @ along
+        s = _along(along, x, y) * depth - c @ along
         depth = (c @ n - 2 * sight.bend * half * (s / half) ** 2 * (depth > 0)) / slope
     return depth
 
 
+def _margin(sight: Sight) -> int:
+    """Pixels beyond the image whose light the blur brings into it."""
+    return int(np.ceil(4 * sight.blur)) + 1
+
+
 def _pieces(n: int, margin: int, pieces: int) -> Array:
     return (np.arange(-margin * pieces - 1, (n + margin) * pieces + 1) + 0.5) / pieces - 0.5
-
-
-def _part(radius: Array, edge: float) -> Array:
-    """The coverage of each sample by the disc inside of an edge: it falls from 1 to 0 over one sample."""
-    across = np.abs(radius[1:-1, 2:] - radius[1:-1, :-2])
-    down = np.abs(radius[2:, 1:-1] - radius[:-2, 1:-1])
-    return np.clip(0.5 + (edge - radius[1:-1, 1:-1]) / (np.maximum(across, down) / 2 + 1e-12), 0, 1)
 
 
 def ellipse_of(sight: Sight) -> tuple[Array, Array]:

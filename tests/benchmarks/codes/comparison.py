@@ -163,8 +163,8 @@ def _paste(image: Array, card: Card, blur: float, shade: Callable[[Array], Array
         sight.lens, width=u1 - u0, height=v1 - v0, cx=sight.lens.cx - u0, cy=sight.lens.cy - v0
     )
     there = replace(sight, lens=lens, uv=(card.uv[0] - u0, card.uv[1] - v0))
-    points = plane_points(there, margin, PIECES)[1:-1, 1:-1]
-    seen = shade(points.reshape(-1, 2)).reshape(points.shape[:2])
+    points = plane_points(there, margin, PIECES)[:, 1:-1, 1:-1]
+    seen = shade(points.reshape(2, -1).T).reshape(points.shape[1:])
     on_card = seen >= 0
     light, cover = (
         _through_lens(layer, blur, margin)

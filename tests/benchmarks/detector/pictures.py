@@ -11,7 +11,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
-from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace
+from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace_card
 
 F = 600.0  # default focal length, pixels
 NOISE = 3.0  # default noise, grey levels
@@ -132,7 +132,7 @@ def _layers(sight: Sight, box: tuple[int, int, int, int]) -> tuple[Array, Array]
     (u0, v0, u1, v1), lens, (u, v) = box, sight.lens, sight.uv
     moved = msgspec.structs.replace(lens, width=u1 - u0, height=v1 - v0, cx=lens.cx - u0, cy=lens.cy - v0)
     there = replace(sight, lens=moved, uv=(u - u0, v - v0))
-    return trace(there, PIECES), trace(replace(there, dark=1.0, bright=1.0, code=0), PIECES)
+    return trace_card(there, PIECES)
 
 
 def grid(count: int, size: tuple[int, int], rng: np.random.Generator) -> list[tuple[float, float]]:
