@@ -15,7 +15,8 @@ Options: `--seeds N` recordings of each case (3), `--jobs N` processes (1), `--c
 
 import argparse
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
@@ -30,6 +31,7 @@ from calib.wand.quality.lenses import describe_open_lenses
 from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.terminal import track
 from tests.benchmarks.calibration_honesty import (
+    FIGURES,
     LIGHT,
     Outcome,
     compute,
@@ -128,6 +130,21 @@ def measure(case: str, seed: int) -> Outcome:
         return Outcome(case, seed, fault=str(error))
 
 
+def of_recordings(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """The outcomes, those of all starts of one recording with their means: starts are no independent samples."""
+    own = [outcome for outcome in outcomes if outcome.cell != "lenses"]
+    starts: dict[int, list[Outcome]] = {}
+    for outcome in outcomes[len(own) :]:
+        starts.setdefault(outcome.seed // STARTS, []).append(outcome)
+    for number, several in starts.items():
+        known = {f: [v for o in several if (v := getattr(o, f)) is not None] for f in FIGURES}
+        means = {figure: float(np.mean(values)) for figure, values in known.items() if values}
+        faults = Counter(outcome.fault for outcome in several if outcome.fault)
+        fault = "; ".join(f"{count} of {len(several)} starts: {text}" for text, count in faults.items())
+        own.append(Outcome("lenses", number, fault=fault, **means))
+    return own
+
+
 def run(arguments: list[str]) -> None:
     """Print a row for each case; figures outside of 0.6 to 1.6 are marked."""
     parser = argparse.ArgumentParser(prog="tests.benchmarks.calibration acceptance")
@@ -135,9 +152,10 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
     options = parser.parse_args(arguments)
+    options.cases.sort(key=list(CASES).index)
     start = time.monotonic()
     count = {case: options.seeds * (STARTS if case == "lenses" else 1) for case in options.cases}
     tasks = [(case, seed) for case, seeds in count.items() for seed in range(seeds)]
     outcomes = list(track(compute(measure, tasks, options.jobs), "calibrating", len(tasks)))
-    report(sorted(outcomes, key=lambda outcome: tasks.index((outcome.cell, outcome.seed))))
+    report(of_recordings(sorted(outcomes, key=lambda outcome: tasks.index((outcome.cell, outcome.seed)))))
     Console().print(f"{len(tasks)} calibrations in {time.monotonic() - start:.0f} s")

@@ -301,7 +301,8 @@ def estimate_shares(information: Array, gradient: Array, sigma: Array, unknown: 
         tried = np.where(kind == KINDS, SHARES[:, None], shares)
         trials = np.where(unknown, tried[:, None], 1.0) * sigma
         likelihood = _log_marginals(information, gradient, trials.reshape(len(SHARES), -1))
-        weight = prior * np.exp(likelihood - likelihood.max())
+        # A share that the prior excludes may be so much likelier that the weights of all others would be 0.
+        weight = prior * np.exp(np.minimum(likelihood - likelihood[prior > 0].max(), 0.0))
         shares[kind == KINDS] = max(np.sqrt(weight @ SHARES**2 / weight.sum()), MIN_SHARE)
     return np.where(unknown, shares, 1.0)
 

@@ -205,3 +205,13 @@ def test_lenses_without_standard_deviations_are_widened_from_the_usual_ones():
         assert sigma is not None
         assert np.allclose(sigma[1:4], 3 * usual_sigma(camera)[1:4])
         assert sigma[0] >= 3 * usual_sigma(camera)[0]
+
+
+def test_lenses_far_beyond_what_the_prior_permits_have_its_largest_share():
+    """Fifty usual deviations off, known to a thousandth of one: shares above 1 would be more than e^745 times likelier,
+    and the prior excludes them."""
+    size, precision = len(KINDS), 1e6
+    prior = np.where(SHARES <= 1.0, STUDENT, 0.0)
+    unknown, gradient = np.ones((1, size), bool), np.full(size, 50 * precision)
+    shares = estimate_shares(precision * np.eye(size), gradient, np.ones((1, size)), unknown, prior)
+    assert shares == pytest.approx(SHARES[SHARES <= 1.0][-1], rel=0.01)
