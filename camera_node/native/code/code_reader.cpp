@@ -329,14 +329,15 @@ LateEdges measure_edges(const Profile& profile, int start, Word seen, double noi
         if (!std::isfinite(black)) continue;
         const auto [x, y] = kAround.at(k + 1, 2 * start * kFinest / m);
         const Parameters& p = fit.p;
-        const double pixels =
-            kMiddle * kTau / kCodeSectors *
-            std::hypot(p[kAxx] * double(y) - p[kAxy] * double(x), p[kAxy] * double(y) - p[kAyy] * double(x));
+        const double along_x = p[kAxx] * double(y) - p[kAxy] * double(x);
+        const double along_y = p[kAxy] * double(y) - p[kAyy] * double(x);
+        const double pixels = kMiddle * kTau / kCodeSectors * std::sqrt(square(along_x) + square(along_y));
         const int next = after != black_at(k + 2), last = before != black_at(k + kCodeSectors - 1);
         const auto row = size_t(edges.count++);
         sign[row] = before ? 1 : -1;
         edges.ones[row] = 1;
-        edges.late[row] = step * (sign[row] * (black - m / 2.0) - m * leak(spread / pixels) * (next - last));
+        edges.late[row] = step * sign[row] * (black - m / 2.0);
+        if (next != last) edges.late[row] -= step * m * leak(spread / pixels) * (next - last);
         // Along a line, pixels interpolated bilinearly have 2/3 of the variance of one pixel a pixel; samples
         // that are farther apart have 4/9 each.
         const double samples = m * 2 / 3.0 * std::max(m / pixels, 2 / 3.0);
@@ -352,8 +353,9 @@ LateEdges measure_edges(const Profile& profile, int start, Word seen, double noi
         for (size_t a = 0; a < kFitErrors; ++a)
             for (size_t b = 0; b < kFitErrors; ++b) with_fit[a] += fit.pose_cov[2 + a][2 + b] * J[i][b];
         for (size_t j = 0; j <= i; ++j) {
-            edges.V[i][j] += sign[i] * sign[j] * square(level);
-            for (size_t a = 0; a < kFitErrors; ++a) edges.V[i][j] += with_fit[a] * J[j][a];
+            const Vector<kFitErrors>& b = J[j];
+            edges.V[i][j] += sign[i] * sign[j] * square(level) + (with_fit[0] * b[0] + with_fit[1] * b[1]) +
+                             (with_fit[2] * b[2] + with_fit[3] * b[3]) + with_fit[4] * b[4];
         }
         for (size_t a = 0; a < kFitErrors; ++a) edges.with_zero[i] += with_fit[a] * of_zero[a];
     }
