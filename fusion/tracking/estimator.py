@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from camera_node.foundation.arrays import Array, Mask
 from fusion import _core
 from fusion.model.observations import CameraArray, MatchedObservations
-from fusion.model.states import States, Transition, predict, reset_unobservable
+from fusion.model.states import OMEGA, VELOCITY, States, Transition, predict, reset_unobservable
 from fusion.model.undistortion import COV, OUTLINE
 from fusion.tracking.gating import AXIS_SIGMA_PX
 from fusion.tracking.headings import linearize_headings, read_headings
@@ -199,15 +199,22 @@ class Estimator:
         if not (tau > STEADY_S).any():
             return observations
         late = np.maximum(tau - STEADY_S, 0)
-        q_angular, q = self.densities[discs.body].T
-        arm2 = np.einsum("in,in->n", discs.position, discs.position)
-        z = self.cameras.views(states, detections.exposures, discs).centre[2]
-        scale = detections.scale
-        moved = np.einsum("ian,jan->ijn", scale, scale) * ((q + q_angular * arm2) * late**3 / 3 / z**2)
+        variance = self.densities[discs.body].T * late**3 / 3
+        moved = self._image_covariance(states, observations, variance)
         return MatchedObservations.of_discs(detections.replaced(COV, detections.cov + moved), discs)
 
+    def _image_covariance(self, states: States, observations: MatchedObservations, variance: Array) -> Array:
+        """(2, 2, N) of discs whose bodies have errors of these variances (2, N), angular and linear."""
+        detections, discs = observations.detections, observations.discs
+        arm2 = np.einsum("in,in->n", discs.position, discs.position)
+        z = self.cameras.views(states, detections.exposures, discs).centre[2]
+        angular, linear = variance
+        per_m = np.einsum("ian,jan->ijn", detections.scale, detections.scale) / z**2
+        return per_m * (linear + angular * arm2)
+
     def _inflate_by_clock(self, states: States, observations: MatchedObservations) -> MatchedObservations:
-        """Add the motion during the standard deviation of the capture time: n sigma_t^2 u u^T, u the image velocity.
+        """Add the motion during the standard deviation of the capture time: n sigma_t^2 (u u^T + C), u the image
+        velocity and C its covariance: after an interruption velocities are hardly known.
 
         The n detections of a body in one frame have a common error, so that their mean has the variance sigma_t^2.
         """
@@ -218,8 +225,10 @@ class Estimator:
         velocity = self._image_velocity(states, observations)
         view = discs.frame * len(states) + discs.body
         sigma = exposures.tau_sigma[discs.frame] * np.sqrt(np.bincount(view)[view])
-        shift = velocity * sigma
-        cov = detections.cov + shift[:, None] * shift
+        P = np.diagonal(states.P, axis1=1, axis2=2)
+        variance = np.stack([P[:, OMEGA].mean(1), P[:, VELOCITY].mean(1)])[:, discs.body]
+        moved = velocity[:, None] * velocity + self._image_covariance(states, observations, variance)
+        cov = detections.cov + sigma**2 * moved
         return MatchedObservations.of_discs(detections.replaced(COV, cov), discs)
 
 
