@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The markers of tracked robots that a camera is certain to see, and where in its image."""
+"""The markers of tracked robots that a camera is certain to see, and where in its image; and the image shift by which a
+camera shows them elsewhere."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +12,9 @@ from fusion.model.observations import CameraArray, Exposures, MarkerTable
 from fusion.model.states import States
 
 MIN_FACING, MARGIN_PX = 0.35, 30.0  # of markers that a camera is certain to see
+SEARCH_PX = 120.0  # largest image shift: 8 degrees at a focal length of 840 px
+BIN_PX = 6.0
+SHIFTED_PX = 2 * BIN_PX  # from where a shift predicts them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,3 +63,31 @@ class ExpectedViews:
         uv, size = lens.project(views.q.T), np.array([lens.width, lens.height])
         seen = ((uv > MARGIN_PX) & (uv < size - MARGIN_PX)).all(1) & (views.facing > MIN_FACING)
         return cls(rows[seen], points[:, seen], uv[seen])
+
+
+def image_shift(expected: Iterable[Array], detected: Iterable[Array]) -> Array:
+    """(2,) the image shift on which most pairs of expected and detected roundels agree, pixels.
+
+    Args:
+        expected, detected: (N, 2) and (M, 2) of each frame of a camera, pixels.
+    """
+    size = int(SEARCH_PX / BIN_PX)
+    votes = np.zeros((2 * size + 1, 2 * size + 1))
+    pairs = zip(expected, detected, strict=True)
+    off = np.concatenate([(there[None] - uv[:, None]).reshape(-1, 2) for uv, there in pairs])
+    off = off[(np.abs(off) < SEARCH_PX).all(1)]
+    np.add.at(votes, tuple(np.round(off / BIN_PX).astype(int).T + size), 1)
+    smooth = sum(np.roll(votes, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))
+    best = (np.array(np.unravel_index(np.argmax(smooth), votes.shape)) - size) * BIN_PX
+    near = off[np.linalg.norm(off - best, axis=1) < SHIFTED_PX]
+    return np.median(near, axis=0) if len(near) else np.zeros(2)
+
+
+def nearest(expected: Array, seen: Array, gate_px: float) -> tuple[Index, Index]:
+    """Rows of expected (N, 2) and seen (M, 2) points that are each other's nearest, within the gate."""
+    if not len(expected) or not len(seen):
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    off = np.linalg.norm(np.nan_to_num(expected, nan=np.inf)[:, None] - seen[None], axis=2)
+    rows, found = np.arange(len(expected)), off.argmin(1)
+    good = (off.argmin(0)[found] == rows) & (off[rows, found] < gate_px)
+    return rows[good], found[good]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Decides which frames of which cameras are used: clocks, frozen images, moved cameras."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from calib.rig.camera import Camera
@@ -62,10 +62,15 @@ class CameraMonitors:
         return replace(frame_set, frames=tuple(f for f in frame_set.frames if f.camera not in excluded))
 
     def check_extrinsics(
-        self, frame_set: FrameSet, now: Snapshot, recalibrates: bool, is_doubtful: bool
+        self,
+        frame_set: FrameSet,
+        now: Snapshot,
+        recalibrates: bool,
+        is_doubtful: bool,
+        displaced: Mapping[int, int],
     ) -> tuple[ExtrinsicsCorrection, ...]:
         """Exclude moved cameras, apply recalibrated poses and correct clocks; see `RigMonitor.check`."""
-        corrections = self.rig.check(frame_set, now, recalibrates, is_doubtful)
+        corrections = self.rig.check(frame_set, now, recalibrates, is_doubtful, displaced)
         for departure in self.rig.take_departures():
             self.clocks.correct(departure)
         self.clocks.hold_common_rate(frame_set.t_ns)

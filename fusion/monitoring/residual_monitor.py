@@ -14,10 +14,12 @@ from scipy.special import chdtri  # the inverse survival function of chi-square
 from camera_node.foundation.arrays import Array, Index
 from fusion._core import SLACK_PX
 
-MIN_RESIDUALS = 12  # in a frame set
 MIN_RATIO = 2.0  # of an unusual residual to the usual one
 SLACK_RATIO = 3.0  # of the largest calibration errors to the usual residual
-LEARNED = 15  # frame sets that define what is usual, also of a camera
+LEARNED = 180  # detections that define what is usual: 15 frame sets of two robots in two cameras
+DECISIVE = float(
+    chdtri(2, 1e-3)
+)  # twice the log-likelihood by which the camera at fault explains more than another
 REJOINED = 0.01  # probability with which detections that agree are left out once more
 POSE_ERRORS = 6  # of a body, which detections determine first
 FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 frame sets a second
@@ -41,9 +43,9 @@ class ResidualMonitor:
             cost: (R,) of the fit of each robot, as of `BodyFit`.
             count: (R,) of its detections.
         """
-        if self._learned < LEARNED or count.sum() < MIN_RESIDUALS:
-            return False
         n = 2 * int(count.sum())
+        if self._learned < LEARNED or not n:
+            return False
         limit = max(float(chdtri(n, FALSE_ALARM)) / n, MIN_RATIO**2 * self._usual_cost)
         return bool(_mean_cost(cost, count) > limit)
 
@@ -59,16 +61,18 @@ class ResidualMonitor:
 
     def learn(self, squared_px: Array, cost: Array, count: Index) -> None:
         """Count a frame set as usual: the squared residuals (N,) of its detections, px^2, and its costs."""
-        if len(squared_px) < MIN_RESIDUALS:
+        if not len(squared_px):
             return
-        self._learned += 1
-        share = 1 / min(self._learned, LEARNED)
+        self._learned += len(squared_px)
+        share = len(squared_px) / min(self._learned, LEARNED)
         self._usual_px += share * (_median_px(squared_px) - self._usual_px)
         self._usual_cost += share * (_mean_cost(cost, count) - self._usual_cost)
 
 
 def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:
     """The camera without which the cost of a frame set falls, far below that without any other; None without one.
+
+    Of two cameras each explains the robots alone: only their predictions show which one is at fault, if they do.
 
     Args:
         cost: with all cameras.
@@ -77,7 +81,8 @@ def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:
     if len(without) < 2:
         return None
     best, second = sorted(without, key=lambda k: without[k])[:2]
-    return best if without[best] < min(cost, without[second]) / MIN_RATIO else None
+    rival = min(cost, without[second])
+    return best if without[best] < min(rival / MIN_RATIO, rival - DECISIVE) else None
 
 
 def _mean_cost(cost: Array, count: Index) -> float:

@@ -39,9 +39,7 @@ BEHIND = 1e6  # squared residual of a disc that is behind its camera
 ADEQUATE = 1.5  # ratio of the mean robust cost to that of noise, up to which a model explains the residuals
 MIN_FOR_PAIRS = 3  # cameras, of which two that move together look like the third: more are needed for pairs
 MAX_SUSPECTS = 4  # cameras that are combined to pairs: those that explain most alone
-# Factors of the errors that the calibration states, which one linearization compares.
-SCALES = 2.0 ** np.arange(-4, 4.25, 0.25)
-ROUNDS = 4  # linearizations: robust weights rise as errors are explained
+SCALES = 2.0 ** np.arange(0, 12, 0.25)  # of the errors that the calibration states
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,6 +168,14 @@ class Fit:
         known = self.squared[np.isfinite(self.squared)]
         return max(1.0, float(np.median(known) / chdtri(2, 0.5))) if len(known) else 1.0
 
+    def noise(self) -> float:
+        """Variance of a whitened residual, with the parameters counted that took their share of the observations; not
+        below 1, infinite if nothing is left."""
+        determined = CAUSES["pose"].stop * len(self.bodies) + int(self.hypothesis.free.sum())
+        left = 1 - determined / (2 * max(1, int(np.isfinite(self.squared).sum())))
+        known = self.squared[np.isfinite(self.squared)]
+        return max(1.0, float(np.median(known) / chdtri(2, 0.5)) / left) if left > 0 else np.inf
+
     @property
     def misfit(self) -> float:
         """Mean squared residual in units of its expectation, not below 1."""
@@ -259,60 +265,52 @@ def retract(T: Array, errors: Array) -> Array:
     return moved
 
 
-def judge(window: Window, starts: Array) -> Verdict:
+def judge(window: Window, starts: Array, moved: Sequence[int] = ()) -> Verdict:
     """Compare the hypotheses.
 
     Args:
         window: the keyframes.
         starts: (C, 8) errors that explain the images of each camera if only this one is at fault.
+        moved: cameras that are known to have moved: a fault is theirs.
     """
     n = len(window.names)
     none = fit(window, Hypothesis.of(None, (), n))
-    scaled = _scaled(window, none)
-    if not is_contradicted(none, n):
-        return Verdict(None, (), none, scale=scaled.hypothesis.scale)
-    verdict = _compare(window, [none, scaled], starts)
-    return replace(verdict, misfit=none.misfit, scale=scaled.hypothesis.scale)
-
-
-def _compare(window: Window, as_stated: Sequence[Fit], starts: Array) -> Verdict:
-    n, seeing = len(window.names), np.unique(window.camera).tolist()
+    if not is_contradicted(none, n, 1.0):
+        return Verdict(None, (), none, scale=_most_likely_scale(window, none))
     everything = fit(window, Hypothesis.of(None, range(n), n, starts))
+    scale = _most_likely_scale(window, everything)
+    if not is_contradicted(none, n, everything.noise()):
+        return Verdict(None, (), none, scale=scale)
     if not everything.is_adequate():  # nor is any other hypothesis
-        return Verdict(None, tuple(range(n)), everything)
+        return Verdict(None, tuple(range(n)), everything, none.misfit, scale)
+    scaled = fit(window, replace(none.hypothesis, scale=scale))
+    return replace(_compare(window, [none, scaled], starts, moved), misfit=none.misfit, scale=scale)
+
+
+def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Sequence[int]) -> Verdict:
+    n, seeing = len(window.names), np.unique(window.camera).tolist()
     fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in seeing]
     if len(seeing) > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
-    return decide([*as_stated, *fits], seeing)
+    theirs = [f for f in fits if f.hypothesis.cause == "pose" and set(moved) <= set(f.hypothesis.cameras)]
+    return decide([*as_stated, *(theirs if moved else fits)], seeing, moved)
 
 
-def _scaled(window: Window, none: Fit) -> Fit:
-    """The fit with all errors of all cameras larger than the calibration states, by the most likely factor: the maximum
-    of the marginal likelihood (MacKay 1992), cameras and robots integrated out.
+def _most_likely_scale(window: Window, best: Fit) -> float:
+    """By how much all errors of all cameras are larger than the calibration states: the best of `SCALES` by the
+    marginal likelihood (MacKay 1992), robots and cameras integrated out. With S the covariance of the errors, A the
+    information of the window about them and b = A x at its maximum,
+    log L = (b^T (A + S^-1)^-1 b - log det(I + S A)) / 2.
 
     Args:
         window: the keyframes.
-        none: the fit without a fault.
+        best: a fit that explains them, where A and b are linearized.
     """
-    for _ in range(ROUNDS):
-        scale = max(1.0, none.hypothesis.scale * _most_likely_scale(window, none))
-        if scale == none.hypothesis.scale:
-            break
-        none = fit(window, replace(none.hypothesis, scale=scale))
-    return none
-
-
-def _most_likely_scale(window: Window, none: Fit) -> float:
-    """The best of `SCALES`, by the linearized problem: with S the covariance, A the information of the window about the
-    errors x of the cameras and b = A x at its maximum, log L = (b^T (A + S^-1)^-1 b - log det(I + S A)) / 2."""
-    A, b = (
-        none.reduced[:, :-1] / none.variance,
-        none.reduced @ np.append(none.errors.ravel(), 1.0) / none.variance,
-    )
+    A, b = best.equations
 
     def gain(scale: float) -> float:
-        S = window.covariance(scale * none.hypothesis.scale)
+        S = window.covariance(scale)
         return float(b @ S @ np.linalg.solve(np.eye(len(S)) + A @ S, b)) - _allowed(S, A)
 
     return float(max(SCALES, key=gain))
@@ -323,18 +321,26 @@ def _allowed(S: Array, A: Array) -> float:
     return float(np.linalg.slogdet(np.eye(len(S)) + S @ A)[1])
 
 
-def is_contradicted(none: Fit, n_cameras: int) -> bool:
+def is_contradicted(none: Fit, n_cameras: int, variance: float) -> bool:
     """Whether errors of the cameras explain more than chance, with those that the prior held back: the score test (Rao
     1948) of all of them together, and how far the prior was stretched. With A the information of the window and x its
-    estimate, the sum is x^T (A^-1 + S)^-1 x, chi-square if the errors have the covariance S of the prior."""
+    estimate, the sum is x^T (A^-1 + S)^-1 x, chi-square if the errors have the covariance S of the prior.
+
+    Args:
+        none: the fit without a fault.
+        n_cameras: of the rig.
+        variance: of whitened residuals, as of a model that explains all that errors of the cameras can: the residuals
+            of `none` contain the fault.
+    """
     observed, gradient = none.reduced[:, :-1], none.reduced[:, -1]
     score = gradient @ np.linalg.solve(observed + np.diag(np.tile(FREE_SIGMA**-2, n_cameras)), gradient)
     stretched = none.errors.ravel() @ none.prior @ none.errors.ravel()
-    return bool(score + stretched > none.variance * chdtri(ERRORS * n_cameras, FALSE_ALARM))
+    return bool(score + stretched > variance * chdtri(ERRORS * n_cameras, FALSE_ALARM))
 
 
-def decide(fits: Sequence[Fit], seeing: Sequence[int]) -> Verdict:
-    """Accept the best hypothesis if it beats all others, and if a majority of the cameras `seeing` is not at fault.
+def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()) -> Verdict:
+    """Accept the best hypothesis if it beats all others, and if a majority of the cameras `seeing` is not at fault, or
+    if these are known to have `moved`.
 
     Only cameras that see robots count: of three, one that turned looks like the two others that turned together.
 
@@ -355,7 +361,7 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int]) -> Verdict:
         and (not best.hypothesis.odds or 2 * len(f.hypothesis.cameras) < len(seeing))
     ]
     cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
-    if not rivals and 2 * len(cameras) < len(seeing):
+    if not rivals and (2 * len(cameras) < len(seeing) or cameras == tuple(moved)):
         return Verdict(cause, cameras, best)
     named = {k for f in (best, *rivals) for k in f.hypothesis.cameras}
     return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best)

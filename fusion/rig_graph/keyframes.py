@@ -8,7 +8,7 @@ pose is where the search of a hypothesis begins.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -18,7 +18,7 @@ from calib.rig.camera import FOCAL_STABILITY, Camera, pixel_jacobians
 from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_rotation
-from fusion.model.expected_views import ExpectedViews
+from fusion.model.expected_views import ExpectedViews, image_shift, nearest
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import (
     CameraArray,
@@ -30,8 +30,6 @@ from fusion.model.observations import (
 from fusion.model.states import Snapshot, States
 from fusion.rig_graph.hypotheses import CAUSES, FREE_SIGMA, Window
 
-SEARCH_PX = 120.0  # largest image shift: 8 degrees at a focal length of 840 px
-BIN_PX = 6.0
 INTERVAL_NS = 90_000_000  # between keyframes: a tenth of a second, at 30 frame sets a second too
 HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its robots
 # Variance of a mean velocity over that of its difference from the mean in half the time, by white acceleration: the
@@ -252,7 +250,7 @@ def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tupl
     Views that show their markers where the calibration expects them need no other pose: a camera that was moved in the
     meantime has some of both kinds.
     """
-    T, matches = camera.matrix(), [_nearest(v.uv, v.frame.roundels.uv, GATES_PX[-1]) for v in views]
+    T, matches = camera.matrix(), [nearest(v.uv, v.frame.roundels.uv, GATES_PX[-1]) for v in views]
     others = [k for k, v in enumerate(views) if len(matches[k][0]) < FOUND * len(v.rows)]
     if sum(len(views[k].rows) for k in others) < ERRORS:
         return T, matches
@@ -265,13 +263,13 @@ def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tupl
 def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tuple[Index, Index]]]:
     """The same for views that show their markers elsewhere."""
     T, matches = camera.matrix(), [(np.empty(0, np.intp), np.empty(0, np.intp)) for _ in views]
-    shift = _image_shift((view.uv for view in views), (view.frame.roundels.uv for view in views))
+    shift = image_shift((view.uv for view in views), (view.frame.roundels.uv for view in views))
     points = np.concatenate([view.points for view in views], axis=1).T
     of_view = np.cumsum([len(view.rows) for view in views])[:-1]
     for gate in GATES_PX:
         moved = msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
         expected = np.split(moved.project_world(points) + shift, of_view)
-        matches = [_nearest(uv, v.frame.roundels.uv, gate) for uv, v in zip(expected, views, strict=True)]
+        matches = [nearest(uv, v.frame.roundels.uv, gate) for uv, v in zip(expected, views, strict=True)]
         pairs = list(zip(views, matches, strict=True))
         shown = np.concatenate([v.points.T[rows] for v, (rows, _) in pairs])
         if len(shown) < ERRORS:
@@ -279,34 +277,6 @@ def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, lis
         T = _fit_pose(camera, T, shown, np.concatenate([v.frame.roundels.uv[d] for v, (_, d) in pairs]))
         shift = np.zeros(2)
     return T, matches
-
-
-def _image_shift(expected: Iterable[Array], detected: Iterable[Array]) -> Array:
-    """(2,) the image shift on which most pairs of expected and detected roundels agree, pixels.
-
-    Args:
-        expected, detected: (N, 2) and (M, 2) of each frame of a camera, pixels.
-    """
-    size = int(SEARCH_PX / BIN_PX)
-    votes = np.zeros((2 * size + 1, 2 * size + 1))
-    pairs = zip(expected, detected, strict=True)
-    off = np.concatenate([(there[None] - uv[:, None]).reshape(-1, 2) for uv, there in pairs])
-    off = off[(np.abs(off) < SEARCH_PX).all(1)]
-    np.add.at(votes, tuple(np.round(off / BIN_PX).astype(int).T + size), 1)
-    smooth = sum(np.roll(votes, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))
-    best = (np.array(np.unravel_index(np.argmax(smooth), votes.shape)) - size) * BIN_PX
-    near = off[np.linalg.norm(off - best, axis=1) < 2 * BIN_PX]
-    return np.median(near, axis=0) if len(near) else np.zeros(2)
-
-
-def _nearest(expected: Array, seen: Array, gate_px: float) -> tuple[Index, Index]:
-    """Rows of expected (N, 2) and seen (M, 2) points that are each other's nearest, within the gate."""
-    if not len(expected) or not len(seen):
-        return np.empty(0, np.intp), np.empty(0, np.intp)
-    off = np.linalg.norm(np.nan_to_num(expected, nan=np.inf)[:, None] - seen[None], axis=2)
-    rows, found = np.arange(len(expected)), off.argmin(1)
-    good = (off.argmin(0)[found] == rows) & (off[rows, found] < gate_px)
-    return rows[good], found[good]
 
 
 def _fit_pose(camera: Camera, T: Array, points: Array, measured: Array) -> Array:

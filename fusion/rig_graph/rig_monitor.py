@@ -105,6 +105,7 @@ class RigMonitor:
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._was_doubtful = False
         self._moments: deque[tuple[FrameSet, Snapshot]] = deque()
+        self._moved: set[str] = set()  # the excluded cameras that showed most markers elsewhere
         self._given: tuple[dict[str, Camera], float, MarkerTable] = {}, 1.0, markers  # to the job
         self._is_confirmed = False  # whether the job confirms a judgement
         self._size_m = 0.0  # of what contradicts, at the robots
@@ -123,6 +124,7 @@ class RigMonitor:
         """Continue with the same cameras and other robots."""
         self.inherit_poses(old)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
+        self._moved = old._moved
         self._scale, self._doubted = old._scale, old._doubted
         self._cameras.scale_errors(old._cameras.error_scale)
 
@@ -177,7 +179,12 @@ class RigMonitor:
         self._forget()
 
     def check(
-        self, frame_set: FrameSet, now: Snapshot, recalibrates: bool, is_doubtful: bool = False
+        self,
+        frame_set: FrameSet,
+        now: Snapshot,
+        recalibrates: bool,
+        is_doubtful: bool,
+        displaced: Mapping[int, int],
     ) -> tuple[ExtrinsicsCorrection, ...]:
         """Judge the cameras if it is time; the cameras to exclude, and those to use with another pose.
 
@@ -187,30 +194,26 @@ class RigMonitor:
             recalibrates: False for the server of a zone that takes the rig from another.
             is_doubtful: whether the frame set contradicts the predictions. When that begins, something changed: the
                 keyframes before do not show what is now.
+            displaced: cameras that show most markers of the frame set elsewhere, and in how many in a row. If one alone
+                does so several times, it moved: the others show the robots where they are predicted.
         """
         self.is_settled = False
+        if (excluded := self._exclude_displaced(displaced)) is not None:
+            return (excluded,)
         if is_doubtful and not self._was_doubtful:
             self._forget()
         self._was_doubtful = is_doubtful
         self._remember_moment(frame_set, now)
-        is_new, kept = self._keyframes.add(frame_set, now), self._keyframes.kept
-        wait_ns = SUSPICIOUS_NS if self.is_doubtful else max(CHECK_NS, self._pause_ns)
-        if (
-            self._job is None
-            and is_new
-            and len(kept) >= min(WINDOWS)
-            and now.t_ns >= self._checked_ns + wait_ns
-        ):
-            self._checked_ns = now.t_ns
-            self._revision = self._cameras.revision
-            self._given = self._cameras.as_dict(), self._scale, self._markers  # of this time
-            self._given_ns, self._is_confirmed = kept[-1].t_ns, False
-            self._start(partial(judge_latest, tuple(kept), *self._given, self._measured_ns))
+        if self._keyframes.add(frame_set, now):
+            self._judge(now.t_ns)
+        return self._act_on_judgements(now.t_ns, recalibrates)
+
+    def _act_on_judgements(self, now_ns: int, recalibrates: bool) -> tuple[ExtrinsicsCorrection, ...]:
         while self._job is not None and self._job.done():
             job, self._job = self._job, None
             if self._revision != self._cameras.revision:
                 return ()
-            self._pause_ns = round((now.t_ns - self._checked_ns) / USUAL_SHARE)
+            self._pause_ns = round((now_ns - self._checked_ns) / USUAL_SHARE)
             try:
                 judged = job.result()
             except (
@@ -220,12 +223,35 @@ class RigMonitor:
                 return ()
             if judged is None:
                 self._is_contradicted = True
-            elif self._is_confirmed or not _blames_one_of_three(*judged[:2]):
+            elif self._is_confirmed or self._moved or not _blames_one_of_three(*judged[:2]):
                 return self._act(*judged, recalibrates)
             else:  # moments are several MB, which no other judgement needs
                 self._is_confirmed = True
                 self._start(partial(confirm, judged, *self._given, tuple(self._moments)))
         return ()
+
+    def _judge(self, now_ns: int) -> None:
+        """Judge the keyframes if it is time."""
+        kept = tuple(self._keyframes.kept)
+        wait_ns = SUSPICIOUS_NS if self.is_doubtful else max(CHECK_NS, self._pause_ns)
+        if self._job is not None or len(kept) < min(WINDOWS) or now_ns < self._checked_ns + wait_ns:
+            return
+        self._checked_ns, self._revision = now_ns, self._cameras.revision
+        self._given = self._cameras.as_dict(), self._scale, self._markers  # of this time
+        self._given_ns, self._is_confirmed = kept[-1].t_ns, False
+        self._start(partial(judge_latest, kept, *self._given, self._measured_ns, sorted(self._moved)))
+
+    def _exclude_displaced(self, displaced: Mapping[int, int]) -> ExtrinsicsCorrection | None:
+        if len(displaced) != 1:
+            return None
+        ((k, n_sets),) = displaced.items()
+        name = self._cameras.names[k]
+        if n_sets < CONFIRMED or name in self.excluded | self.pinned:
+            return None
+        self.excluded.add(name)
+        self._moved.add(name)
+        self._forget()
+        return ExtrinsicsCorrection(name, None)
 
     def _start(self, job: Callable[[], Judgement | None]) -> None:
         self._job = _done(job) if self.executor is None else self.executor.submit(job)
@@ -381,6 +407,7 @@ class RigMonitor:
 
     def _use(self, name: str) -> None:
         self.excluded.discard(name)
+        self._moved.discard(name)
         self._forget()
         self._walk.forget_poses()
         self._is_contradicted, self._n_undecided = False, 0
@@ -408,6 +435,7 @@ def judge_latest(
     error_scale: float,
     markers: MarkerTable,
     since_ns: int,
+    moved: Sequence[str],
 ) -> Judgement | None:
     """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
     cameras' errors is measured."""
@@ -415,7 +443,7 @@ def judge_latest(
     for n in WINDOWS:
         if n <= len(keyframes):
             window, starts = window_of(keyframes[-n:], array, markers)
-            verdict = judge(window, starts)
+            verdict = judge(window, starts, [array.index[name] for name in moved])
             if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict, _measure(window, verdict, keyframes[-n:], since_ns)
     return None
@@ -436,7 +464,8 @@ def confirm(
     (window, verdict, measured), scene = judged, (CameraArray(dict(cameras), error_scale), markers)
     if moments and _moved_alone(Moments(*zip(*moments, strict=True)), scene, window, verdict):
         return judged
-    return window, replace(verdict, cause=None, cameras=tuple(np.unique(window.camera).tolist())), measured
+    undecided = replace(verdict, cause=None, cameras=tuple(np.unique(window.camera).tolist()))
+    return window, undecided, measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)

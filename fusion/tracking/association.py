@@ -17,7 +17,8 @@ prediction P, and the density of all roundels in the image:
 
 A robot of which much is missing needs more than what its missing markers cost: log(1 - P_D) each, and at most the
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
-probability that it does now.
+probability that it does now. A camera that shows most of what it usually sees elsewhere, all by one image shift, was
+moved: what it still shows near the predictions is not theirs.
 """
 
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ from scipy.optimize import linear_sum_assignment
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
+from fusion.model.expected_views import SHIFTED_PX, ExpectedViews, image_shift, nearest
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import (
     Assignments,
@@ -242,6 +244,10 @@ class OwnDetections:
         cameras: cameras of the rig.
         estimator: of all robots.
         markers: of all robots.
+
+    Attributes:
+        displaced: cameras of the last frame set that showed most markers elsewhere, and in how many in a row of those
+            with their frames.
     """
 
     def __init__(self, cameras: CameraArray, estimator: Estimator, markers: MarkerTable) -> None:
@@ -249,6 +255,8 @@ class OwnDetections:
         self._shape = (len(estimator.single), len(cameras.names))
         self._usual, self._learned = np.zeros(self._shape), np.zeros(self._shape, np.intp)
         self._unseen = np.zeros(self._shape, bool)  # in the last frame of the camera
+        self._elsewhere = np.zeros(len(cameras.names), np.intp)  # frame sets in a row, of each camera
+        self.displaced = dict[int, int]()
 
     def are_own(self, given: AssignedFrames) -> Mask:
         """(N,) assignments of a frame set that are more probable than detections of something else."""
@@ -258,10 +266,15 @@ class OwnDetections:
         frames = np.bincount(given.detections.exposures.camera, minlength=self._shape[1])
         count = self._count(view)
         missing = np.maximum(self._usual * frames - count, 0)
+        displaced = self._find_displaced(given, count, missing)
+        count[:, displaced] = missing[:, displaced] = 0
+        self._elsewhere = np.where(displaced, self._elsewhere + 1, np.where(frames > 0, 0, self._elsewhere))
+        self.displaced = {k: int(self._elsewhere[k]) for k in np.flatnonzero(displaced).tolist()}
+        frames = np.where(displaced, 0, frames)
         cost = np.maximum(missing * MISSED, CHANGED).sum(1)
         fallen = (count.sum(1) > 0) & (missing.sum(1) > count.sum(1))
         unseen = self._unseen & (count > 0) & ~fallen[:, None]
-        own = ~(fallen[robot] | unseen.ravel()[view])
+        own = ~(fallen[robot] | unseen.ravel()[view] | displaced[view % self._shape[1]])
         if fallen.any() or unseen.any():
             own[self._accepted(given, view, own, _Changes(fallen, unseen, cost))] = True
         self._learn(self._count(view[own]), frames, given.tracked)
@@ -295,6 +308,28 @@ class OwnDetections:
         accepted[fallen] = is_own[: len(fallen), None]
         accepted[seen, by] = is_own[len(fallen) :]
         return rows[accepted[robot, camera] & ~certain[rows]]
+
+    def _find_displaced(self, given: AssignedFrames, count: Index, missing: Array) -> Mask:
+        """(C,) the cameras in which most markers that they usually show are elsewhere, all by one image shift.
+
+        Args:
+            given: a frame set.
+            count, missing: (R, C) markers that were assigned in each camera, and those that usually are, and were not.
+        """
+        usual, found = (count + missing).sum(0), np.zeros(self._shape[1], bool)
+        for k in np.flatnonzero(missing.sum(0) > count.sum(0)).tolist():
+            rows = np.flatnonzero(
+                given.tracked[self._markers.robot] & (self._usual[self._markers.robot, k] > 0)
+            )
+            exposures, seen = given.detections.exposures, given.detections
+            shown = 0
+            for frame in np.flatnonzero(exposures.camera == k).tolist():
+                tau, uv = float(exposures.tau[frame]), seen.uv[:, seen.frame == frame].T
+                scene = self._cameras, self._cameras.names[k], given.states, tau, (self._markers, rows)
+                expected = ExpectedViews.of(*scene).uv
+                shown += len(nearest(expected + image_shift([expected], [uv]), uv, SHIFTED_PX)[0])
+            found[k] = shown > max(usual[k] / 2, count[:, k].sum())
+        return found
 
     def _density(self, detections: DetectionTable) -> Array:
         """(F,) detections per pixel^2 in the frames up to the last one with a detection."""

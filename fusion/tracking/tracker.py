@@ -180,8 +180,10 @@ class Tracker:
     def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection, ...]:
         """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
         now = Snapshot(frame_set.t_ns, self.table.states, self.table.located)
-        is_doubtful = self.robust.is_doubtful
-        corrections = self.monitors.check_extrinsics(frame_set, now, self._recalibrates, is_doubtful)
+        is_doubtful, displaced = self.robust.is_doubtful, self.own.displaced
+        corrections = self.monitors.check_extrinsics(
+            frame_set, now, self._recalibrates, is_doubtful or bool(displaced), displaced
+        )
         if self.monitors.rig.is_settled and is_doubtful:
             self.robust.settle()
         if corrections:

@@ -16,11 +16,15 @@ MOTIONS = {
 }
 
 
-def moved(turn_deg: float, shift_m: float) -> tuple[Arena, Arena]:
-    """An arena, and the same with cam1 rotated and shifted along axes that are not parallel to a coordinate axis."""
+AXIS = 0.6, 0.64, 0.48
+
+
+def moved(turn_deg: float, shift_m: float, axis: tuple[float, float, float] = AXIS) -> tuple[Arena, Arena]:
+    """An arena, and the same with cam1 rotated about an axis of its own frame, and shifted along one that is not
+    parallel to a coordinate axis."""
     before = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
     T = before.cameras["cam1"].matrix()
-    T[:3, :3] = T[:3, :3] @ rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.64, 0.48]))
+    T[:3, :3] = T[:3, :3] @ rotation_from_vector(np.radians(turn_deg) * np.array(axis))
     T[:3, 3] += shift_m * np.array([0.48, -0.6, 0.64])
     cameras = dict(before.cameras)
     cameras["cam1"] = msgspec.structs.replace(cameras["cam1"], T_world_cam=Pose.from_matrix(T))

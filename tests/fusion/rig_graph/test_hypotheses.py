@@ -103,7 +103,7 @@ def test_errors_far_beyond_their_prior_are_contradicted(sigmas: float, contradic
     none = fitted(None, (), 3, 0.0)
     errors = none.errors.copy()
     errors[1, 7] = sigmas
-    assert is_contradicted(replace(none, errors=errors), 3) == contradicts
+    assert is_contradicted(replace(none, errors=errors), 3, 1.0) == contradicts
 
 
 def test_the_camera_is_named_that_explains_more_than_every_other():
