@@ -163,7 +163,7 @@ def calibration_table(readout_ms: float, seeds: int) -> Table:
             off = result.time_offset_ms - truth
             offsets.append(off - off.mean())
             squared, degrees = joint_error(result, recorded.truth)
-            normalized.append((clock_error(result, recorded), squared / degrees))
+            normalized.append((clock_error(result, recorded.truth), squared / degrees))
             if result.readout_sigma_ms.any():
                 readouts.append([result.readout_ms - readout, result.readout_sigma_ms])
         clocks, poses = np.mean(normalized, axis=0)
