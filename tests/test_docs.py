@@ -49,10 +49,16 @@ NOT_RUN = (
     "install -D configs/systemd",
     "systemctl ",
     "pipx run cibuildwheel",
+    "uv tool install ",
     "podman ",
 )
 BUILD = ("cargo ", "cmake ", "build/")  # of the example clients
-PIP = ("python3 -m venv ", "/opt/roundel/bin/pip ", "pip wheel ")  # tests/test_packaging.py
+PIP = (
+    "python3 -m venv ",
+    "/opt/roundel/bin/pip ",
+    "pip wheel ",
+    "uv tool install ",
+)  # tests/test_packaging.py
 
 
 def test_every_command_of_every_page_is_tested():

@@ -53,17 +53,20 @@ def end_process(code: int) -> NoReturn:
     os._exit(code)
 
 
-def return_freed_memory() -> None:
+def return_freed_memory(period_s: float = PERIOD_S) -> None:
     """Share one arena between all threads, and return free pages periodically; without effect where glibc is not used.
 
     To be called before the program starts threads. Zenoh has a thread for each core and more, and glibc gives each
     thread an arena of its own. Messages of changing sizes leave free memory in all of them, so that the resident memory
     of a program grows for hours although it uses no more. `malloc_trim` returns what is free at the end of the first
     arena only, so all threads share that one.
+
+    Args:
+        period_s: between two returns.
     """
     if (library := glibc()) is not None:
         library.mallopt(M_ARENA_MAX, MAX_ARENAS)
-        threading.Thread(target=_trim_periodically, args=(library,), daemon=True).start()
+        threading.Thread(target=_trim_periodically, args=(library, period_s), daemon=True).start()
 
 
 def glibc() -> ctypes.CDLL | None:
@@ -75,7 +78,7 @@ def glibc() -> ctypes.CDLL | None:
     return library
 
 
-def _trim_periodically(library: ctypes.CDLL) -> None:
+def _trim_periodically(library: ctypes.CDLL, period_s: float) -> None:
     while True:
-        time.sleep(PERIOD_S)
+        time.sleep(period_s)
         library.malloc_trim(0)
