@@ -16,10 +16,9 @@ from fusion._core import SLACK_PX
 
 MIN_RATIO = 2.0  # of an unusual residual to the usual one
 SLACK_RATIO = 3.0  # of the largest calibration errors to the usual residual
-LEARNED = 180  # detections that define what is usual: 15 frame sets of two robots in two cameras
-DECISIVE = float(
-    chdtri(2, 1e-3)
-)  # twice the log-likelihood by which the camera at fault explains more than another
+LEARNED = 15  # frame sets that define what is usual
+# Twice the log-likelihood by which the camera at fault explains more than another: a thousand times as probable.
+DECISIVE = float(chdtri(2, 1e-3))
 REJOINED = 0.01  # probability with which detections that agree are left out once more
 POSE_ERRORS = 6  # of a body, which detections determine first
 FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 frame sets a second
@@ -63,8 +62,8 @@ class ResidualMonitor:
         """Count a frame set as usual: the squared residuals (N,) of its detections, px^2, and its costs."""
         if not len(squared_px):
             return
-        self._learned += len(squared_px)
-        share = len(squared_px) / min(self._learned, LEARNED)
+        self._learned += 1
+        share = 1 / min(self._learned, LEARNED)
         self._usual_px += share * (_median_px(squared_px) - self._usual_px)
         self._usual_cost += share * (_mean_cost(cost, count) - self._usual_cost)
 

@@ -28,7 +28,7 @@ from fusion.model.observations import (
 )
 from fusion.model.states import POSITION, States
 from fusion.model.undistortion import COV
-from fusion.monitoring.residual_monitor import ResidualMonitor, camera_at_fault
+from fusion.monitoring.residual_monitor import LEARNED, ResidualMonitor, camera_at_fault
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
 from fusion.tracking.rays import GATE
@@ -38,7 +38,6 @@ SUSPICIOUS = 4.0
 # Correction of a position in standard deviations of its prediction: those of frames 33 ms apart have 11 mm. No false
 # roundel has displaced a robot by more than its correction and the error of its prediction.
 MIN_CORRECTION = 0.5
-FALL = 0.5 ** (1 / 15)  # of the noise in a frame set: by half in half a second
 MAX_ADDED_PX2 = 32.0**2  # noise that makes anything usual within the gates of association
 CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
 
@@ -104,7 +103,7 @@ class RobustUpdate:
         """The updated states, and the assignments that fit."""
         fitted = self._fit(prediction, detections, assignments)
         if self.added_px2:
-            self.added_px2 *= FALL if self.added_px2 > self._least_px2(fitted) else 0.0
+            self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
         if (again := self._left_out_again(fitted, assignments)) is not None:
             fitted = again
         elif not self._is_unusual(fitted):
