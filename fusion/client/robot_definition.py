@@ -27,6 +27,7 @@ from camera_node.protocol.messages import Keys, MessageError, decode
 from camera_node.protocol.requests import REQUEST_S, RequestSource
 from fusion.errors import FusionError
 from fusion.model.likeness import SIDE_COS, distances
+from fusion.model.nearest import mutual_nearest
 from fusion.model.robots import MotionModel, Robot
 from fusion.protocol.pose_messages import Markers, Robots, RobotsRequest
 from fusion.protocol.robot_requests import change_robots, request_robots
@@ -137,7 +138,7 @@ def find_stationary_markers(messages: Sequence[Markers]) -> StationaryMarkers:
     reference = max(unlabeled, key=len, default=np.empty((0, COLUMNS)))
     seen = np.full((len(unlabeled), len(reference), COLUMNS), np.nan)
     for row, markers in zip(seen, unlabeled, strict=True):
-        ours, theirs = _mutual_nearest(reference[:, PLACE], markers[:, PLACE])
+        ours, theirs = mutual_nearest(reference[:, PLACE], markers[:, PLACE], SAME_M)
         row[ours] = markers[theirs]
     seen = seen[:, np.isfinite(seen[:, :, 0]).sum(0) >= max(1, MIN_SEEN * len(seen))]
     if not seen.size:
@@ -189,16 +190,6 @@ def _unlabeled(message: Markers) -> Array:
     columns = message.positions(), message.normals(), *alone, message.zeros()
     rows = np.hstack(columns).astype(float)[message.unlabeled()]
     return rows[np.isfinite(rows[:, PLACE]).all(1)]
-
-
-def _mutual_nearest(a: Array, b: Array) -> tuple[Index, Index]:
-    """Rows of points a (N, 3) and b (M, 3) that are each other's nearest, closer than `SAME_M`."""
-    if not (len(a) and len(b)):
-        return np.empty(0, int), np.empty(0, int)
-    distance = np.linalg.norm(a[:, None] - b, axis=2)
-    nearest, rows = distance.argmin(1), np.arange(len(a))
-    rows = rows[(distance.argmin(0)[nearest] == rows) & (distance[rows, nearest] < SAME_M)]
-    return rows, nearest[rows]
 
 
 def _median_known(values: Array) -> float:

@@ -81,13 +81,3 @@ def image_shift(expected: Iterable[Array], detected: Iterable[Array]) -> Array:
     best = (np.array(np.unravel_index(np.argmax(smooth), votes.shape)) - size) * BIN_PX
     near = off[np.linalg.norm(off - best, axis=1) < SHIFTED_PX]
     return np.median(near, axis=0) if len(near) else np.zeros(2)
-
-
-def nearest(expected: Array, seen: Array, gate_px: float) -> tuple[Index, Index]:
-    """Rows of expected (N, 2) and seen (M, 2) points that are each other's nearest, within the gate."""
-    if not len(expected) or not len(seen):
-        return np.empty(0, np.intp), np.empty(0, np.intp)
-    off = np.linalg.norm(np.nan_to_num(expected, nan=np.inf)[:, None] - seen[None], axis=2)
-    rows, found = np.arange(len(expected)), off.argmin(1)
-    good = (off.argmin(0)[found] == rows) & (off[rows, found] < gate_px)
-    return rows[good], found[good]

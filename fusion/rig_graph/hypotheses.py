@@ -165,16 +165,19 @@ class Fit:
     @property
     def variance(self) -> float:
         """Of a whitened residual, by the median, not below 1."""
-        known = self.squared[np.isfinite(self.squared)]
-        return max(1.0, float(np.median(known) / chdtri(2, 0.5))) if len(known) else 1.0
+        return max(1.0, self._median())
 
     def noise(self) -> float:
         """Variance of a whitened residual, with the parameters counted that took their share of the observations; not
         below 1, infinite if nothing is left."""
         determined = CAUSES["pose"].stop * len(self.bodies) + int(self.hypothesis.free.sum())
         left = 1 - determined / (2 * max(1, int(np.isfinite(self.squared).sum())))
+        return max(1.0, self._median() / left) if left > 0 else np.inf
+
+    def _median(self) -> float:
+        """Variance of a whitened residual by the median; 0 without any."""
         known = self.squared[np.isfinite(self.squared)]
-        return max(1.0, float(np.median(known) / chdtri(2, 0.5)) / left) if left > 0 else np.inf
+        return float(np.median(known) / chdtri(2, 0.5)) if len(known) else 0.0
 
     @property
     def misfit(self) -> float:
@@ -289,12 +292,13 @@ def judge(window: Window, starts: Array, moved: Sequence[int] = ()) -> Verdict:
 
 def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Sequence[int]) -> Verdict:
     n, seeing = len(window.names), np.unique(window.camera).tolist()
+    if moved:
+        return decide([*as_stated, fit(window, Hypothesis.of("pose", moved, n, starts))], seeing, moved)
     fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in seeing]
     if len(seeing) > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
-    theirs = [f for f in fits if f.hypothesis.cause == "pose" and set(moved) <= set(f.hypothesis.cameras)]
-    return decide([*as_stated, *(theirs if moved else fits)], seeing, moved)
+    return decide([*as_stated, *fits], seeing)
 
 
 def _most_likely_scale(window: Window, best: Fit) -> float:

@@ -18,8 +18,9 @@ from calib.rig.camera import FOCAL_STABILITY, Camera, pixel_jacobians
 from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_rotation
-from fusion.model.expected_views import ExpectedViews, image_shift, nearest
+from fusion.model.expected_views import ExpectedViews, image_shift
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.nearest import mutual_nearest
 from fusion.model.observations import (
     CameraArray,
     DetectionTable,
@@ -250,7 +251,7 @@ def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tupl
     Views that show their markers where the calibration expects them need no other pose: a camera that was moved in the
     meantime has some of both kinds.
     """
-    T, matches = camera.matrix(), [nearest(v.uv, v.frame.roundels.uv, GATES_PX[-1]) for v in views]
+    T, matches = camera.matrix(), [mutual_nearest(v.uv, v.frame.roundels.uv, GATES_PX[-1]) for v in views]
     others = [k for k, v in enumerate(views) if len(matches[k][0]) < FOUND * len(v.rows)]
     if sum(len(views[k].rows) for k in others) < ERRORS:
         return T, matches
@@ -269,7 +270,9 @@ def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, lis
     for gate in GATES_PX:
         moved = msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
         expected = np.split(moved.project_world(points) + shift, of_view)
-        matches = [nearest(uv, v.frame.roundels.uv, gate) for uv, v in zip(expected, views, strict=True)]
+        matches = [
+            mutual_nearest(uv, v.frame.roundels.uv, gate) for uv, v in zip(expected, views, strict=True)
+        ]
         pairs = list(zip(views, matches, strict=True))
         shown = np.concatenate([v.points.T[rows] for v, (rows, _) in pairs])
         if len(shown) < ERRORS:

@@ -17,8 +17,8 @@ prediction P, and the density of all roundels in the image:
 
 A robot of which much is missing needs more than what its missing markers cost: log(1 - P_D) each, and at most the
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
-probability that it does now. A camera that shows most of what it usually sees elsewhere, all by one image shift, was
-moved: what it still shows near the predictions is not theirs.
+probability that it does now. A camera that alone shows most of what it usually sees elsewhere, all by one image shift,
+was moved: what it still shows near the predictions is not theirs.
 """
 
 from collections.abc import Sequence
@@ -29,8 +29,9 @@ from scipy.optimize import linear_sum_assignment
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.expected_views import SHIFTED_PX, ExpectedViews, image_shift, nearest
+from fusion.model.expected_views import SHIFTED_PX, ExpectedViews, image_shift
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.nearest import mutual_nearest
 from fusion.model.observations import (
     Assignments,
     CameraArray,
@@ -310,26 +311,35 @@ class OwnDetections:
         return rows[accepted[robot, camera] & ~certain[rows]]
 
     def _find_displaced(self, given: AssignedFrames, count: Index, missing: Array) -> Mask:
-        """(C,) the cameras in which most markers that they usually show are elsewhere, all by one image shift.
+        """(C,) the cameras in which most markers that they usually show are elsewhere, all by one image shift, while
+        another camera shows these robots where they are predicted.
 
         Args:
             given: a frame set.
             count, missing: (R, C) markers that were assigned in each camera, and those that usually are, and were not.
         """
-        usual, found = (count + missing).sum(0), np.zeros(self._shape[1], bool)
-        for k in np.flatnonzero(missing.sum(0) > count.sum(0)).tolist():
-            rows = np.flatnonzero(
-                given.tracked[self._markers.robot] & (self._usual[self._markers.robot, k] > 0)
-            )
-            exposures, seen = given.detections.exposures, given.detections
-            shown = 0
-            for frame in np.flatnonzero(exposures.camera == k).tolist():
-                tau, uv = float(exposures.tau[frame]), seen.uv[:, seen.frame == frame].T
-                scene = self._cameras, self._cameras.names[k], given.states, tau, (self._markers, rows)
-                expected = ExpectedViews.of(*scene).uv
-                shown += len(nearest(expected + image_shift([expected], [uv]), uv, SHIFTED_PX)[0])
-            found[k] = shown > max(usual[k] / 2, count[:, k].sum())
+        found, lost = np.zeros(self._shape[1], bool), missing.sum(0) > count.sum(0)
+        for k in np.flatnonzero(lost).tolist():
+            robots = given.tracked & (self._usual[:, k] > 0)
+            here = count[robots][:, ~lost].sum(0), missing[robots][:, ~lost].sum(0)
+            if not (
+                here[0] > here[1]
+            ).any():  # no other camera shows that the robots are where they are predicted
+                continue
+            rows = np.flatnonzero(robots[self._markers.robot])
+            elsewhere = self._shifted(given, k, rows)
+            found[k] = elsewhere > max((count + missing)[:, k].sum() / 2, count[:, k].sum())
         return found
+
+    def _shifted(self, given: AssignedFrames, camera: int, rows: Index) -> int:
+        """How many of the markers `rows` the frames of a camera show by one image shift."""
+        exposures, seen, shown = given.detections.exposures, given.detections, 0
+        for frame in np.flatnonzero(exposures.camera == camera).tolist():
+            tau, uv = float(exposures.tau[frame]), seen.uv[:, seen.frame == frame].T
+            scene = self._cameras, self._cameras.names[camera], given.states, tau, (self._markers, rows)
+            expected = ExpectedViews.of(*scene).uv
+            shown += len(mutual_nearest(expected + image_shift([expected], [uv]), uv, SHIFTED_PX)[0])
+        return shown
 
     def _density(self, detections: DetectionTable) -> Array:
         """(F,) detections per pixel^2 in the frames up to the last one with a detection."""

@@ -137,17 +137,54 @@ def test_of_two_cameras_one_of_which_turns_no_pose_is_wrong(turn_deg, axis, excl
     assert contradicting == ([] if excluded else [("cam0", "cam1")])
 
 
+def put(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """R and p of a robot that is put elsewhere at once."""
+    R, p = around(t)
+    return R, np.add(p, [0.0, 0.3 * (t > MOVE_S), 0.0])
+
+
 def test_a_robot_that_is_put_elsewhere_moves_no_camera():
     """The camera whose frame is the first after that shows all markers elsewhere, and then all cameras do."""
-
-    def put(t: float) -> tuple[np.ndarray, np.ndarray]:
-        R, p = around(t)
-        return R, np.add(p, [0.0, 0.3 * (t > MOVE_S), 0.0])
-
     arena = Arena({"a": TRIANGLE}, {"a": put}, sigma_px=0.1)
     cameras = {name: arena.cameras[name] for name in ("cam0", "cam1")}
     frames = [f for f in arena.frames(60) if f.camera in cameras]
     assert follow(Tracker(cameras, {"a": TRIANGLE}), frames) == ([], ["tracked"])
+
+
+def test_a_robot_that_only_one_camera_sees_does_not_show_that_this_one_moved():
+    """The other one shows nothing from before the robot is put elsewhere."""
+    arena = Arena({"a": TRIANGLE}, {"a": put}, sigma_px=0.1)
+    cameras = {name: arena.cameras[name] for name in ("cam0", "cam1")}
+    tracker, synchronizer, displaced = Tracker(cameras, {"a": TRIANGLE}), FrameSynchronizer(PERIOD_NS), []
+    for frame in (f for f in arena.frames(40) if f.camera in cameras):
+        hidden = frame.camera == "cam1" and arena.seconds(frame.t_ns) > 0.5
+        synchronizer.add(black(frame) if hidden else frame)
+        for frame_set in synchronizer.take(frame.t_ns):
+            tracker.track(frame_set)
+            displaced += tracker.own.displaced
+    assert displaced == []
+
+
+def test_two_of_three_cameras_that_are_moved_one_after_the_other_stay_excluded():
+    """By 3 degrees, each shows most markers elsewhere. One camera does not show their new poses, and a robot that is
+    where it was for this one does not bring them back."""
+    before, after = moved(3.0, 0.0, (-0.88, -0.43, 0.2))
+    T = before.cameras["cam2"].matrix()
+    T[:3, :3] = T[:3, :3] @ rotation_from_vector([0.04, -0.03, 0.01])
+    turned = msgspec.structs.replace(before.cameras["cam2"], T_world_cam=Pose.from_matrix(T))
+    both = Arena(ROBOTS, MOTIONS, cameras=after.cameras | {"cam2": turned}, sigma_px=0.1)
+    times = [0.0, MOVE_S, 2 * MOVE_S, np.inf]
+    frames = [
+        frame
+        for arena, begin, end in zip((before, after, both), times, times[1:], strict=False)
+        for frame in arena.frames(90)
+        if begin <= arena.seconds(frame.t_ns) < end and frame.camera != "cam3"
+    ]
+    cameras = {name: camera for name, camera in before.cameras.items() if name != "cam3"}
+    corrections, _ = follow(Tracker(cameras, ROBOTS), frames)
+    excluded = [c.name for c in corrections if c.camera is None]
+    assert excluded == ["cam1", "cam2"]
+    assert not any(c.has_returned for c in corrections)
 
 
 def test_of_many_cameras_of_which_three_see_robots_none_is_blamed(caplog):
