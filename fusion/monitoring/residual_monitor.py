@@ -13,12 +13,11 @@ from scipy.special import chdtri  # the inverse survival function of chi-square
 
 from camera_node.foundation.arrays import Array, Index
 from fusion._core import SLACK_PX
+from fusion.rig_graph.hypotheses import RIVAL
 
 MIN_RATIO = 2.0  # of an unusual residual to the usual one
 SLACK_RATIO = 3.0  # of the largest calibration errors to the usual residual
 LEARNED = 15  # frame sets that define what is usual
-# Twice the log-likelihood by which the camera at fault explains more than another: a thousand times as probable.
-DECISIVE = float(chdtri(2, 1e-3))
 REJOINED = 0.01  # probability with which detections that agree are left out once more
 POSE_ERRORS = 6  # of a body, which detections determine first
 FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 frame sets a second
@@ -81,7 +80,7 @@ def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:
         return None
     best, second = sorted(without, key=lambda k: without[k])[:2]
     rival = min(cost, without[second])
-    return best if without[best] < min(rival / MIN_RATIO, rival - DECISIVE) else None
+    return best if without[best] < min(rival / MIN_RATIO, rival - chdtri(2, RIVAL)) else None
 
 
 def _mean_cost(cost: Array, count: Index) -> float:

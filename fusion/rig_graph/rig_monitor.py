@@ -200,6 +200,7 @@ class RigMonitor:
         self.is_settled = False
         if (excluded := self._exclude_displaced(displaced)) is not None:
             return (excluded,)
+        is_doubtful = is_doubtful or bool(displaced)
         if is_doubtful and not self._was_doubtful:
             self._forget()
         self._was_doubtful = is_doubtful

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Mask
 from fusion import _core
-from fusion.model.observations import CameraArray, MatchedObservations
+from fusion.model.observations import CameraArray, MatchedObservations, Views
 from fusion.model.states import OMEGA, VELOCITY, States, Transition, predict, reset_unobservable
 from fusion.model.undistortion import COV, OUTLINE
 from fusion.tracking.gating import AXIS_SIGMA_PX
@@ -165,13 +165,15 @@ class Estimator:
         """The estimator of some of the bodies."""
         return Estimator(self.cameras, self.densities[rows], self.single[rows])
 
-    def _image_velocity(self, states: States, observations: MatchedObservations) -> Array:
+    def _views(self, states: States, observations: MatchedObservations) -> Views:
+        return self.cameras.views(states, observations.detections.exposures, observations.discs)
+
+    def _image_velocity(self, states: States, observations: MatchedObservations, now: Views) -> Array:
         """(2, N) velocities of the discs' images, pixels/s; 0 where the disc is not visible."""
-        exposures, discs = observations.detections.exposures, observations.discs
+        exposures = observations.detections.exposures
         later = replace(exposures, tau=exposures.tau + EXACT_S)
-        moved = (self.cameras.views(states, at, discs).xy for at in (later, exposures))
-        scale = observations.detections.scale
-        return np.nan_to_num(np.einsum("ijn,jn->in", scale, np.subtract(*moved)) / EXACT_S)
+        moved = self.cameras.views(states, later, observations.discs).xy - now.xy
+        return np.nan_to_num(np.einsum("ijn,jn->in", observations.detections.scale, moved) / EXACT_S)
 
     def _straighten(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """Undo the shear of the outlines of discs that moved while a rolling shutter read their rows.
@@ -184,7 +186,8 @@ class Estimator:
         if not line_s.any():
             return observations
         B = np.tile(np.eye(2), (len(seen), 1, 1))
-        B[:, :, 1] -= (self._image_velocity(states, observations) * line_s).T
+        velocity = self._image_velocity(states, observations, self._views(states, observations))
+        B[:, :, 1] -= (velocity * line_s).T
         axes_px, angle_rad = _sheared(seen.axes_px, seen.angle_rad, B)
         return replace(observations, detections=seen.replaced(OUTLINE, np.vstack([axes_px, angle_rad])))
 
@@ -200,17 +203,8 @@ class Estimator:
             return observations
         late = np.maximum(tau - STEADY_S, 0)
         variance = self.densities[discs.body].T * late**3 / 3
-        moved = self._image_covariance(states, observations, variance)
+        moved = _image_covariance(observations, self._views(states, observations), variance)
         return MatchedObservations.of_discs(detections.replaced(COV, detections.cov + moved), discs)
-
-    def _image_covariance(self, states: States, observations: MatchedObservations, variance: Array) -> Array:
-        """(2, 2, N) of discs whose bodies have errors of these variances (2, N), angular and linear."""
-        detections, discs = observations.detections, observations.discs
-        arm2 = np.einsum("in,in->n", discs.position, discs.position)
-        z = self.cameras.views(states, detections.exposures, discs).centre[2]
-        angular, linear = variance
-        per_m = np.einsum("ian,jan->ijn", detections.scale, detections.scale) / z**2
-        return per_m * (linear + angular * arm2)
 
     def _inflate_by_clock(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """Add the motion during the standard deviation of the capture time: n sigma_t^2 (u u^T + C), u the image
@@ -222,14 +216,23 @@ class Estimator:
         exposures = detections.exposures
         if not (exposures.tau_sigma > EXACT_S).any():
             return observations
-        velocity = self._image_velocity(states, observations)
+        now = self._views(states, observations)
+        velocity = self._image_velocity(states, observations, now)
         view = discs.frame * len(states) + discs.body
         sigma = exposures.tau_sigma[discs.frame] * np.sqrt(np.bincount(view)[view])
         P = np.diagonal(states.P, axis1=1, axis2=2)
         variance = np.stack([P[:, OMEGA].mean(1), P[:, VELOCITY].mean(1)])[:, discs.body]
-        moved = velocity[:, None] * velocity + self._image_covariance(states, observations, variance)
+        moved = velocity[:, None] * velocity + _image_covariance(observations, now, variance)
         cov = detections.cov + sigma**2 * moved
         return MatchedObservations.of_discs(detections.replaced(COV, cov), discs)
+
+
+def _image_covariance(observations: MatchedObservations, views: Views, variance: Array) -> Array:
+    """(2, 2, N) of discs whose bodies have errors of these variances (2, N), angular and linear."""
+    scale, position = observations.detections.scale, observations.discs.position
+    angular, linear = variance
+    per_m = np.einsum("ian,jan->ijn", scale, scale) / views.centre[2] ** 2
+    return per_m * (linear + angular * np.einsum("in,in->n", position, position))
 
 
 def _sheared(axes_px: Array, angle_rad: Array, B: Array) -> tuple[Array, Array]:

@@ -182,7 +182,7 @@ class Tracker:
         now = Snapshot(frame_set.t_ns, self.table.states, self.table.located)
         is_doubtful, displaced = self.robust.is_doubtful, self.own.displaced
         corrections = self.monitors.check_extrinsics(
-            frame_set, now, self._recalibrates, is_doubtful or bool(displaced), displaced
+            frame_set, now, self._recalibrates, is_doubtful, displaced
         )
         if self.monitors.rig.is_settled and is_doubtful:
             self.robust.settle()

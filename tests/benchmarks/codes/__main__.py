@@ -75,7 +75,7 @@ class Benchmark:
             _print(
                 "equal printed area, one picture of a mild camera",
                 headings,
-                comparison.rows(self.count // 48),
+                comparison.rows(max(1, self.count // 48)),
             )
         if self._measures("reading"):
             headings = ("diameter, px", "coded", "plain", "plain, on tiles")
