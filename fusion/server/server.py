@@ -391,8 +391,7 @@ def _prepare_lenses(data: bytes) -> None:
 @contextlib.contextmanager
 def collecting_between_frame_sets() -> Iterator[Callable[[], object]]:
     """Collect garbage only when the yielded function is called: between frame sets, once a second."""
-    gc.collect()
-    gc.freeze()  # imported modules are not searched again
+    gc.freeze()  # imported modules are never searched: among them is no garbage
     gc.disable()
     try:
         yield gc.collect

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Draws a view in a thread, and opens its page in Chromium, of which one process serves all tests: its start, and the
-compilation of the page's shaders, are most of the work of a test."""
+"""Draws a view in a thread, and opens its page in Chromium, of which one process serves all tests, as one of Playwright
+does: their starts are a third of the work of a test."""
 
 import functools
 import shutil
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
-from playwright.sync_api import ConsoleMessage, Page, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
 
 from tests.conftest import free_port
 from tests.processes import killed_at_end
@@ -90,20 +90,23 @@ def value_of(view: View, label: str) -> Any:
 
 
 @functools.cache
-def _start_chromium(program: str) -> str:
-    """The address at which the running Chromium is controlled."""
+def _start_chromium(program: str) -> Callable[[], Browser]:
+    """Start Chromium; each call of the result is a connection to it, which closes what was opened by it alone."""
     folder = tempfile.TemporaryDirectory(prefix="roundel-chromium-", ignore_cleanup_errors=True)
     profile = Path(_until_the_end.enter_context(folder))
     command = [sys.executable, "-c", START, program, *FLAGS, f"--user-data-dir={profile}"]
     _until_the_end.enter_context(killed_at_end(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
     written = profile / "DevToolsActivePort"
     wait_for(lambda: written.exists() and written.read_text().count("\n"))
-    return f"http://127.0.0.1:{written.read_text().splitlines()[0]}"
+    address = f"http://127.0.0.1:{written.read_text().splitlines()[0]}"
+    playwright = _until_the_end.enter_context(sync_playwright())
+    return lambda: playwright.chromium.connect_over_cdp(address)
 
 
 def end_chromium() -> None:
-    """At the end of all tests."""
+    """Until the next test of the page. Playwright leaves the thread of the tests an event loop that runs."""
     _until_the_end.close()
+    _start_chromium.cache_clear()
 
 
 @contextmanager
@@ -117,9 +120,7 @@ def browsing(view: View, url: str = "") -> Iterator[Page]:
         if message.type == "error":
             errors.append(message.text)
 
-    address = _start_chromium(CHROMIUM)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.connect_over_cdp(address)
+    with _start_chromium(CHROMIUM)() as browser:
         page = browser.new_page(viewport={"width": 1000, "height": 700})
         page.set_default_timeout(1e3 * DEADLINE_S)
         page.on("console", record)
@@ -130,6 +131,4 @@ def browsing(view: View, url: str = "") -> Iterator[Page]:
         except BaseException:
             print(f"the page shows:\n{page.inner_text('body')}")  # pytest adds it to the failure
             raise
-        finally:
-            browser.close()
     assert not errors

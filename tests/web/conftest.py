@@ -7,6 +7,7 @@ from contextlib import ExitStack
 import pytest
 
 from camera_node.protocol.server_connection import ServerConnection
+from tests.conftest import is_of_page
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
 from tests.web.browser import drawing, end_chromium, loopback
@@ -16,11 +17,10 @@ from web.state.subscription import Subscription
 from web.view import View
 
 
-@pytest.fixture(scope="session", autouse=True)
-def one_chromium() -> Iterator[None]:
-    """Ends the browser that the first test of the page started."""
-    yield
-    end_chromium()
+def pytest_runtest_teardown(nextitem: pytest.Item | None) -> None:
+    """End the browser that the first test of the page started after the last one."""
+    if nextitem is None or not is_of_page(nextitem):
+        end_chromium()
 
 
 @pytest.fixture

@@ -98,7 +98,7 @@ def test_ends_are_distinguished(scenario: WandScenario):
 
 def test_cameras_with_faults_are_named():
     """One has a clock error of three seconds and is placed, one shares too few frame sets."""
-    recorded = record(replace(LIGHTS, cameras=4))
+    recorded = record(replace(LIGHTS, cameras=4, seconds=8.0))
     late = [
         msgspec.structs.replace(m, t_ns=m.t_ns + 3_000_000_000) if m.camera == "cam01" else m
         for m in unnumbered(recorded.messages)
