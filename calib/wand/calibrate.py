@@ -50,7 +50,6 @@ from calib.wand.initial_rig import (
 )
 from calib.wand.labels import explain_codes, explain_wand, label_recording
 from calib.wand.quality.checks import (
-    check_clocks,
     check_lenses,
     check_motion,
     check_sizes,
@@ -437,7 +436,6 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
     rough = scale_rig(rough)
     coarse = adjust_coarsely(recording, rough)
     check_lenses(recording.names, coarse)
-    check_clocks(recording.names, coarse)
     coarse = inflate_covariance(coarse)
     check_mirrored(recording.wand, coarse)
     clocks = choose_clocks(coarse, recording.timing)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
-from calib.wand.trajectory import hermite
+from calib.wand.trajectory import finite_velocities, hermite
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.columns import Columns
 from camera_node.geometry.body import Body
@@ -273,11 +273,7 @@ class MarkerTrack:
     @classmethod
     def of(cls, t_s: Array, xy: Array) -> "MarkerTrack":
         """Compute velocities by central differences."""
-        if len(t_s) < 2:
-            return cls(t_s, xy, np.zeros_like(xy))
-        step = np.diff(xy, axis=0) / np.diff(t_s)[:, None]
-        velocity = np.concatenate([step[:1], (step[1:] + step[:-1]) / 2, step[-1:]])
-        return cls(t_s, xy, velocity)
+        return cls(t_s, xy, finite_velocities(t_s, xy[:, None], np.inf)[:, 0])
 
     def interpolate(self, t_s: Array, gap_s: float) -> Array:
         """Return positions (..., 2) at timestamps (...), by cubic Hermite polynomials; NaN in gaps above `gap_s`,

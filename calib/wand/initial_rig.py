@@ -44,7 +44,6 @@ MANY = 32  # markers of a wand, above which not all of its lengths are compared
 SAMPLE = 1500  # detections that the essential matrix is fitted to
 GATE_PX = 5.0
 MAX_SPREAD = 0.15  # of the logarithm of the scale, over the wand's lengths: a larger one rejects the pose
-QUANTILE = 0.3  # of Sampson distances, that are compared: 30 % of the correspondences are right at the least
 MIN_INLIER_RATIO = 0.5  # of the correspondences: fewer inliers reject a pose
 MAX_SHIFT_S = 0.32  # largest trial shift: twice the difference of clocks that the server synchronizes
 SHIFT_STEP_S = 0.01
@@ -94,16 +93,6 @@ class _Correspondences:
     rows: Index
     xy_a: Array
     xy_b: Array
-
-
-@dataclass(frozen=True, slots=True)
-class _RelativePose:
-    """T_a_b with a translation of length 1, its inliers (n,), and a low quantile of the Sampson distances."""
-
-    matches: _Correspondences
-    T_a_b: Array
-    inlier: Mask
-    misfit: float
 
 
 class TwoViewGeometry:
@@ -159,14 +148,16 @@ class TwoViewGeometry:
         return matches.xy_a, matches.xy_b
 
     def _estimate(self, a: int, b: int) -> TwoView | None:
-        pose, shift_s = self._estimate_with_shift(a, b)
-        if pose is None:
+        rows = self._overlapping_rows(a, b)
+        shift_s = self._find_shift(b, rows)
+        matches = self._correspond(rows, b, shift_s)
+        if (found := self._fit_pose(a, b, matches)) is None:
             return None
-        matches, T_a_b = pose.matches, pose.T_a_b.copy()
-        inliers = matches.rows[pose.inlier]
+        T_a_b, inlier = found
+        inliers = matches.rows[inlier]
         if self._count_frames(inliers) < MIN_FRAME_SETS:
             return None
-        points = intersect_rays(T_a_b, matches.xy_a[pose.inlier], matches.xy_b[pose.inlier])
+        points = intersect_rays(T_a_b, matches.xy_a[inlier], matches.xy_b[inlier])
         ratios = self._scale_ratios(points, inliers)
         scale = float(np.median(ratios)) if len(ratios) else 1.0
         if len(ratios) and np.median(np.abs(np.log(ratios / scale))) > MAX_SPREAD:
@@ -176,19 +167,6 @@ class TwoViewGeometry:
         depth = _lengths(inliers, points * scale) | self._depths_of_b(inliers, points_b, b, shift_s)
         ratio = len(inliers) / len(matches.rows)
         return TwoView(a, b, T_a_b, shift_s, len(inliers), ratio, len(ratios) > 0, depth)
-
-    def _estimate_with_shift(self, a: int, b: int) -> tuple[_RelativePose | None, float]:
-        """Return the relative pose up to scale and the clock shift, 0 unless the data show one."""
-        rows = self._overlapping_rows(a, b)
-        selected, shift_s = self.detections.select(rows), self._find_shift(b, rows)
-        unshifted = self._fit_pose(a, b, rows, 0.0)
-        shifted = self._fit_pose(a, b, rows, shift_s) if shift_s else None
-        if shifted is None:
-            return unshifted, 0.0
-        counts = len(shifted.matches.rows), len(np.unique(selected.t_s))
-        if unshifted is not None and not supports_shift(unshifted.misfit, shifted.misfit, *counts):
-            return unshifted, 0.0
-        return shifted, shift_s
 
     def _find_shift(self, b: int, rows: Index) -> float:
         if self.timing.synchronous:
@@ -221,9 +199,8 @@ class TwoViewGeometry:
         good = np.isfinite(other[:, 0])
         return _Correspondences(rows[good], found.xy[good], other[good])
 
-    def _fit_pose(self, a: int, b: int, rows: Index, shift_s: float) -> _RelativePose | None:
-        """Fit the essential matrix to the detections `rows` of camera a at a clock shift."""
-        matches = self._correspond(rows, b, shift_s)
+    def _fit_pose(self, a: int, b: int, matches: _Correspondences) -> tuple[Array, Mask] | None:
+        """T_a_b with a translation of length 1 by the essential matrix of correspondences (n), and its inliers (n,)."""
         if self._count_frames(matches.rows) < MIN_FRAME_SETS:
             return None
         xy_a, xy_b, K = matches.xy_a, matches.xy_b, np.eye(3)
@@ -232,10 +209,7 @@ class TwoViewGeometry:
         if E is None or E.shape != (3, 3):
             return None
         _, R, t, mask = cv2.recoverPose(E, xy_a, xy_b, K, mask=mask)[:4]
-        distances = sampson(np.asarray(E, float), xy_a, xy_b)
-        return _RelativePose(
-            matches, invert(motion_from(R, t)), mask.ravel() > 0, float(np.quantile(distances, QUANTILE))
-        )
+        return invert(motion_from(R, t)), mask.ravel() > 0
 
     def _count_frames(self, rows: Index) -> int:
         return len(np.unique(self.detections.frame[rows]))
@@ -328,18 +302,12 @@ def find_shift(
     better = np.log((usual + MIN_MISFIT) / (np.where(known, misfits, usual) + MIN_MISFIT))
     best = int(np.where(known, (common.sum(axis=1) - FITTED) * better, -np.inf).argmax())
     times = len(np.unique(t_s[common[best]]))
-    if times < MIN_TIMES or not supports_shift(
-        misfits[middle], misfits[best], int(common[best].sum()), times
-    ):
+    independent = min(int(common[best].sum()), 2 * times) - FITTED
+    if times < MIN_TIMES or misfits[middle] <= misfits[best] * np.exp(EVIDENCE / independent):
         return 0.0
     fine = coarse[best] + step_s * np.linspace(-1, 1, 11)
     misfits = epipolar_misfits(xy, interpolate(tracks, label, t_s + fine[:, None], gap_s))
     return float(fine[np.argmin(misfits)])
-
-
-def supports_shift(unshifted: float, shifted: float, correspondences: int, times: int) -> bool:
-    """Return whether the misfits without and with a shift show that the clocks differ."""
-    return bool(unshifted > shifted * np.exp(EVIDENCE / (min(correspondences, 2 * times) - FITTED)))
 
 
 def epipolar_misfits(xy_a: Array, xy_b: Array) -> Array:

@@ -29,7 +29,7 @@ from calib.wand.quality.checks import check_lenses
 from calib.wand.recording_checks import check_recording
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
-from camera_node.geometry.pose import invert
+from camera_node.geometry.pose import invert, vector_from_rotation
 from camera_node.protocol.messages import Detections
 
 MAX_FRAME_SETS = 300
@@ -152,19 +152,15 @@ def _conclude(rig: Rig, name: str, this: int, solution: Solution) -> Recalibrati
     camera = adjusted_camera(before, adjusted, covariance, this, float(offset_ms))
     used = adjusted.used & (observations.camera == this)
     change = None if before.T_world_cam is None else invert(before.matrix()) @ T
+    turn = None if change is None else vector_from_rotation(change[:3, :3])
     return Recalibration(
         rig=msgspec.structs.replace(rig, cameras={**rig.cameras, name: camera}),
         name=name,
         moved_mm=None if change is None else float(np.linalg.norm(change[:3, 3])) * 1e3,
-        turned_deg=None if change is None else _angle_deg(change),
+        turned_deg=None if turn is None else float(np.degrees(np.linalg.norm(turn))),
         residual_px=float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())),
         sigma_mm=float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
         time_sigma_ms=float(sigma_ms),
         adjusted=adjusted,
         observations=observations,
     )
-
-
-def _angle_deg(T: Array) -> float:
-    """Rotation angle of a rigid motion (4, 4), degrees."""
-    return float(np.degrees(np.arccos(np.clip((np.trace(T) - 2) / 2, -1, 1))))

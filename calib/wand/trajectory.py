@@ -91,7 +91,7 @@ def whitened_constant_velocity(dt: Array, density: float) -> Array:
 
 
 def finite_velocities(knot_s: Array, points: Array, gap_s: float) -> Array:
-    """Velocities (K, B, 3) at the knots by central differences of positions (K, B, 3); 0 where no knot is within
+    """Velocities (K, B, d) at the knots by central differences of positions (K, B, d); 0 where no knot is within
     `gap_s`."""
     velocity = np.zeros_like(points)
     if len(knot_s) < 2:

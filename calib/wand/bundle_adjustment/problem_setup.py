@@ -34,6 +34,7 @@ from calib.wand.detections import (
     MarkerTrack,
     WandDetections,
     WandRecording,
+    group_rows,
 )
 from calib.wand.trajectory import acceleration_density, finite_velocities
 from camera_node.foundation.arrays import Array, Index, Mask
@@ -62,7 +63,8 @@ def build_problem(recording: WandRecording, cameras: Array, offset_s: Array, bud
     """
     rows, knot, knot_s = _choose_detections(recording, offset_s, budget)
     wand, gap_s = AffineWand.of(recording.wand), recording.timing.gap_s
-    basis = initial_positions(recording.tracks, wand, cameras, offset_s, knot_s, gap_s)
+    markers = triangulate(recording.tracks, cameras, offset_s, knot_s, gap_s)
+    basis = interpolate_missing(knot_s, solve_basis(markers, wand), gap_s)
     basis = _locate_missing(recording, basis, cameras, offset_s, knot_s)
     known = np.asarray(np.isfinite(basis).all(axis=(1, 2)))
     if known.sum() < MIN_KNOTS:
@@ -244,28 +246,6 @@ def choose_frame_sets(
     return chosen[:count]
 
 
-def initial_positions(
-    tracks: Sequence[Sequence[MarkerTrack]],
-    wand: AffineWand,
-    cameras: Array,
-    offset_s: Array,
-    knot_s: Array,
-    gap_s: float,
-) -> Array:
-    """(K, B, 3) positions of the wand's basis markers at the knots, world; NaN where unknown.
-
-    Args:
-        tracks: by camera and marker, by stamps.
-        wand: in affine coordinates.
-        cameras: (C, 4, 4) T_world_cam.
-        offset_s: (C,) true time = stamp + offset.
-        knot_s: (K,) ascending.
-        gap_s: longest time over which positions are interpolated.
-    """
-    markers = triangulate(tracks, cameras, offset_s, knot_s, gap_s)
-    return interpolate_missing(knot_s, solve_basis(markers, wand), gap_s)
-
-
 def solve_basis(markers: Array, wand: AffineWand) -> Array:
     """Positions of the basis markers (K, B, 3) from those of all markers (K, M, 3), by least squares; NaN where the
     lengths are wrong or too few markers are known."""
@@ -332,9 +312,8 @@ def match_points(detections: WandDetections, true_s: Array, gap_s: float) -> Bac
         true_s: (n,) true capture times.
         gap_s: the longest time over which images are interpolated; 0 if only frames of equal time are simultaneous.
     """
-    groups = [
-        group for rows in _by_number(detections.label) for group in _match(detections, true_s, rows, gap_s)
-    ]
+    by_number = group_rows(detections.label, int(detections.label.max(initial=-1)) + 1)
+    groups = [group for rows in by_number for group in _match(detections, true_s, rows, gap_s)]
     if len(groups) > MAX_POINTS:
         groups = [groups[k] for k in spread_evenly(len(groups), MAX_POINTS)]
     if not groups:
@@ -343,12 +322,6 @@ def match_points(detections: WandDetections, true_s: Array, gap_s: float) -> Bac
     return BackgroundPoints(
         point, *(np.concatenate([getattr(g, name) for g in groups]) for name in ("camera", "uv", "cov"))
     )
-
-
-def _by_number(label: Index) -> list[Index]:
-    """The rows of each number."""
-    order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
 def _match(

@@ -36,7 +36,6 @@ MAX_SIZE_ERROR = 0.04
 MAX_SPACING_ERROR = 0.03  # of the wand's length: the error of any distance between its markers is below it
 MIN_MEASURED = 8  # frame sets at which a distance is measured
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
-WRONG_CLOCK_S = 1.0  # offset: synchronized clocks differ by milliseconds, others by more than a second
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
 CLEARLY = 0.25  # of this distance, that the rays of synchronous cameras pass each other at most, if exchanged rightly
 MIN_SHARE, MIN_COUNT = 0.02, 8  # of a camera's detections, from which its points count as exchanged
@@ -74,21 +73,6 @@ def _probability(distance: float) -> float:
     from scipy.special import chdtrc
 
     return float(chdtrc(len(LENS), len(LENS) * distance**2))
-
-
-def check_clocks(names: Sequence[str], adjusted: Adjusted) -> None:
-    """Raise CameraFault where a clock is farther off than the server's synchronization allows."""
-    offset_s = adjusted.state.clocks[:, 0] - np.median(adjusted.state.clocks[:, 0])
-    k, reference = int(np.abs(offset_s).argmax()), int(np.abs(offset_s).argmin())
-    if abs(offset_s[k]) > WRONG_CLOCK_S:
-        raise CameraFault(
-            {
-                names[k]: (
-                    f"its timestamps are {abs(offset_s[k]):.2f} s {'earlier' if offset_s[k] > 0 else 'later'} than "
-                    f"those of '{names[reference]}'; set its clock (chrony or NTP) and record again"
-                )
-            }
-        )
 
 
 def check_motion(detections: WandDetections, names: Sequence[str], lenses: Sequence[Lens]) -> None:
