@@ -250,42 +250,26 @@ class _Sticks:
         speed = abs(np.diff(self.vectors()))[within] / np.diff(self.t_s)[within]
         return 2 * float(np.median(speed)) if len(speed) else FASTEST
 
-
-@dataclass(frozen=True, slots=True)
-class _StickTracks:
-    """Both ends over time: the frames, the velocities (n, 2, 2) at them, and the longest gap to interpolate."""
-
-    sticks: _Sticks
-    velocity: Array
-    gap_s: float
-
-    @classmethod
-    def of(cls, sticks: _Sticks, gap_s: float) -> "_StickTracks":
-        """Compute velocities by central differences within runs."""
-        separated_s = sticks.t_s + SEPARATION_S * sticks.run
-        return cls(sticks, finite_velocities(separated_s, sticks.xy, gap_s), gap_s)
-
-    def interpolate(self, rows: Index, t_s: Array) -> tuple[Array, Index]:
-        """Interpolate the frames `rows` of one camera at timestamps (m,).
+    def interpolate(self, rows: Index, t_s: Array, gap_s: float) -> tuple[Array, Index]:
+        """Interpolate the frames `rows` of one camera at timestamps (m,), within runs and gaps of at most `gap_s`.
 
         Returns:
             ends: (m, 2, 2) both ends; NaN outside of runs.
             segment: (m,) the segment of the nearest frame.
         """
-        sticks = self.sticks
-        after = np.clip(np.searchsorted(sticks.t_s[rows], t_s), 1, len(rows) - 1)
-        left, right = rows[after - 1], rows[after]
-        tau, dt = t_s - sticks.t_s[left], sticks.t_s[right] - sticks.t_s[left]
-        knots = np.stack(
-            [sticks.xy[left], self.velocity[left], sticks.xy[right], self.velocity[right]], axis=1
-        )
+        stamps, xy, run = self.t_s[rows], self.xy[rows], self.run[rows]
+        velocity = finite_velocities(stamps + SEPARATION_S * run, xy, gap_s)
+        right = np.clip(np.searchsorted(stamps, t_s), 1, len(rows) - 1)
+        left = right - 1
+        tau, dt = t_s - stamps[left], stamps[right] - stamps[left]
+        knots = np.stack([xy[left], velocity[left], xy[right], velocity[right]], axis=1)
         ends = np.einsum("nh,nhex->nex", hermite(tau, dt), knots)
-        inside = (sticks.run[left] == sticks.run[right]) & (dt <= self.gap_s) & (tau >= 0) & (tau <= dt)
+        inside = (run[left] == run[right]) & (dt <= gap_s) & (tau >= 0) & (tau <= dt)
         nearest = np.where(tau > dt / 2, right, left)
-        simultaneous = np.abs(sticks.t_s[nearest] - t_s) < SIMULTANEOUS_S
-        ends = np.where(simultaneous[:, None, None], sticks.xy[nearest], ends)
+        simultaneous = np.abs(stamps[nearest] - t_s) < SIMULTANEOUS_S
+        ends = np.where(simultaneous[:, None, None], xy[nearest], ends)
         ends[~(inside | simultaneous)] = np.nan
-        return ends, sticks.segment[nearest]
+        return ends, self.segment[rows[nearest]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,17 +287,17 @@ def label_ends(timing: Timing, detections: WandDetections, wand: Body, lenses: S
     sticks = _chain(detections, timing)
     if not len(sticks.rows):
         return np.full(len(detections), -1, np.intp)
-    tracks, light = _StickTracks.of(sticks, timing.gap_s), replace_fields(wand, markers=((0.0, 0.0, 0.0),))
+    gap_s, light = timing.gap_s, replace_fields(wand, markers=((0.0, 0.0, 0.0),))
     middles = TwoViewGeometry(_middles(detections, sticks), lenses, light, timing)
     start = build_initial_rig(middles, cameras)
-    labels = _label(sticks, _estimate_signs(tracks, start, lenses, COARSE_PX), len(detections))
+    labels = _label(sticks, _estimate_signs(sticks, gap_s, start, lenses, COARSE_PX), len(detections))
     if not (labels >= 0).any():
         return labels
     labeled = replace(detections, label=labels).select(labels >= 0)
     refined = build_initial_rig(TwoViewGeometry(labeled, lenses, wand, timing), cameras)
     if len(refined.poses) < len(start.poses):
         return labels
-    return _label(sticks, _estimate_signs(tracks, refined, lenses, FINE_PX), len(detections))
+    return _label(sticks, _estimate_signs(sticks, gap_s, refined, lenses, FINE_PX), len(detections))
 
 
 def _chain(detections: WandDetections, timing: Timing) -> _Sticks:
@@ -387,30 +371,30 @@ def _label(sticks: _Sticks, signs: Index, count: int) -> Index:
 
 
 def _estimate_signs(
-    tracks: _StickTracks, start: InitialRig, lenses: Sequence[Lens], sigma_px: float
+    sticks: _Sticks, gap_s: float, start: InitialRig, lenses: Sequence[Lens], sigma_px: float
 ) -> Index:
     """Return (S,) the sign of each segment, 1 or -1; 0 where the evidence is too small.
 
     Segments of cameras without a pose keep their order; `diagnosis` explains later why they have none.
     """
-    sticks, evidence = tracks.sticks, []
+    evidence = []
     for a, b in combinations(start.placed, 2):
         sigma = sigma_px / np.mean([lenses[a].fx, lenses[b].fx])
-        evidence.append(_epipolar_evidence(tracks, start, (a, b), float(sigma)))
+        evidence.append(_epipolar_evidence(sticks, gap_s, start, (a, b), float(sigma)))
     evidence += [
-        _turn_evidence(tracks, lag) for lag in (1, 2)
+        _turn_evidence(sticks, gap_s, lag) for lag in (1, 2)
     ]  # of three frames, the middle one may be wrong
     signs = _synchronize(int(sticks.segment.max()) + 1, evidence)
     signs[sticks.segment[~np.isin(sticks.camera, start.placed)]] = 1
     return signs
 
 
-def _turn_evidence(tracks: _StickTracks, lag: int) -> _Evidence:
+def _turn_evidence(sticks: _Sticks, gap_s: float, lag: int) -> _Evidence:
     """Compare segments of a camera by the change of the image vector between frames `lag` apart (Cauchy density)."""
-    sticks, vectors = tracks.sticks, tracks.sticks.vectors()
+    vectors = sticks.vectors()
     k = np.arange(len(sticks.rows) - lag)
     k = k[(sticks.segment[k] < sticks.segment[k + lag]) & (sticks.camera[k] == sticks.camera[k + lag])]
-    k = k[sticks.t_s[k + lag] - sticks.t_s[k] <= tracks.gap_s]
+    k = k[sticks.t_s[k + lag] - sticks.t_s[k] <= gap_s]
     before, now = vectors[k], vectors[k + lag]
     usual = sticks.usual_change() * (sticks.t_s[k + lag] - sticks.t_s[k])
     same, swapped = (np.log1p((abs(now + sign * before) / usual) ** 2) for sign in (-1, 1))
@@ -418,15 +402,15 @@ def _turn_evidence(tracks: _StickTracks, lag: int) -> _Evidence:
 
 
 def _epipolar_evidence(
-    tracks: _StickTracks, start: InitialRig, pair: tuple[int, int], sigma: float
+    sticks: _Sticks, gap_s: float, start: InitialRig, pair: tuple[int, int], sigma: float
 ) -> _Evidence:
     """Compare segments of two cameras that overlap in time by their epipolar residuals (Cauchy density)."""
-    (a, b), sticks = pair, tracks.sticks
+    a, b = pair
     mine, theirs = np.flatnonzero(sticks.camera == a), np.flatnonzero(sticks.camera == b)
     if not len(mine) or len(theirs) < 2:
         return _Evidence(mine[:0], mine[:0], np.empty(0))
     t_s = sticks.t_s[mine] + start.offset_s[a] - start.offset_s[b]
-    other, segment = tracks.interpolate(theirs, t_s)
+    other, segment = sticks.interpolate(theirs, t_s, gap_s)
     T = invert(start.poses[b]) @ start.poses[a]
     E = skew(T[:3, 3]) @ T[:3, :3]
     ends = sticks.xy[mine]
