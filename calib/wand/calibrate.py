@@ -62,7 +62,7 @@ from calib.wand.recording_checks import check_cameras, check_inside, check_recor
 from calib.wand.scale import Distance
 from calib.wand.trajectory import acceleration_density
 from calib.wand.wand_report import NOT_RECORDED, Exchange, WandCalibration
-from camera_node.foundation.arrays import Array, Mask
+from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
@@ -133,8 +133,9 @@ def _calibrate_by_any_clocks(
         if (aligned := _calibrate_aligned(rig, wand, given, distance)) is None:
             raise
         return aligned
-    if not _suspects_clocks(result):
-        return result
+    unplaced = any(why != NOT_RECORDED for why in result.report.unplaced.values())
+    if not unplaced and not (np.abs(result.adjusted.state.clocks[:, 1]) > SLEWED_DRIFT).any():
+        return result  # all cameras are placed, and no clock drifts as none of a computer does
     aligned = _calibrate_aligned(rig, wand, given, distance)
     return aligned if aligned is not None and len(aligned.names) >= len(result.names) else result
 
@@ -148,12 +149,6 @@ class _Recorded:
     background: Sequence[Detections]
     synchronous: bool
     aligned: bool = False
-
-
-def _suspects_clocks(result: WandCalibration) -> bool:
-    """Whether cameras that saw the wand are not placed, or clocks drift as no clock of a computer does."""
-    seen = [name for name, why in result.report.unplaced.items() if why != NOT_RECORDED]
-    return bool(seen) or bool((np.abs(result.adjusted.state.clocks[:, 1]) > SLEWED_DRIFT).any())
 
 
 def _calibrate_aligned(
@@ -306,8 +301,7 @@ def _fit_half(recording: WandRecording) -> tuple[int, float, float]:
     if len(start.placed) < 2:
         return 0, np.inf, np.inf
     try:
-        rough = scale_rig(RoughRig.of(start))
-        state = adjust_coarsely(half.of_cameras(start.placed), rough, BUDGET).state
+        state = adjust_coarsely(half.of_cameras(start.placed), RoughRig.of(start), BUDGET).state
     except CalibrationError:
         return 0, np.inf, np.inf
     rest = recording.select(~fitted).of_cameras(start.placed)
@@ -417,23 +411,31 @@ class RoughRig:
 
     @classmethod
     def of(cls, start: InitialRig, distance: tuple[int, int, float] | None = None) -> "RoughRig":
-        """The placed cameras of an initial rig, ascending."""
-        poses, offset_s = (
+        """The placed cameras of an initial rig, ascending; scaled to the measured distance, or to 1 m between the
+        farthest cameras if there is no scale."""
+        cameras, offset_s = (
             np.array([column[k] for k in start.placed]) for column in (start.poses, start.offset_s)
         )
-        return cls(poses, offset_s, start.metric, distance)
+        if distance is not None or not start.metric:
+            a, b, wanted = distance or (*_farthest(cameras)[:2], 1.0)
+            cameras[:, :3, 3] *= wanted / np.linalg.norm(cameras[a, :3, 3] - cameras[b, :3, 3])
+        return cls(cameras, offset_s, start.metric, distance)
+
+
+def _farthest(cameras: Array) -> tuple[int, int, float]:
+    """The two cameras farthest apart, and their distance."""
+    gaps = np.linalg.norm(cameras[:, None, :3, 3] - cameras[None, :, :3, 3], axis=2)
+    a, b = np.unravel_index(int(gaps.argmax()), gaps.shape)
+    return int(a), int(b), float(gaps[a, b])
 
 
 def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
     """Adjust a rough rig by a recording of the wand.
 
-    Where nothing gives the scale, the two cameras farthest apart are put 1 m apart.
-
     Raises:
         CalibrationError: the wand's lengths do not fit the observations or the roundels' sizes.
         CameraFault: a camera's lens differs from its file, or its observations contradict those of the others.
     """
-    rough = scale_rig(rough)
     coarse = adjust_coarsely(recording, rough)
     check_lenses(recording.names, coarse)
     coarse = inflate_covariance(coarse)
@@ -447,22 +449,6 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
         check_spacing(recording.wand, solution.adjusted, solution.observations)
     solution = replace(solution, adjusted=inflate_covariance(solution.adjusted))
     return _validate(recording, solution)
-
-
-def scale_rig(rough: RoughRig) -> RoughRig:
-    """The rig scaled to the measured distance, or to 1 m between the farthest cameras if it has no scale."""
-    if rough.distance is None and rough.metric:
-        return rough
-    a, b, wanted = rough.distance or (*_farthest(rough.cameras)[:2], 1.0)
-    cameras = rough.cameras.copy()
-    cameras[:, :3, 3] *= wanted / np.linalg.norm(cameras[a, :3, 3] - cameras[b, :3, 3])
-    return replace(rough, cameras=cameras)
-
-
-def _farthest(cameras: Array) -> tuple[int, int, float]:
-    gaps = np.linalg.norm(cameras[:, None, :3, 3] - cameras[None, :, :3, 3], axis=2)
-    a, b = np.unravel_index(int(gaps.argmax()), gaps.shape)
-    return int(a), int(b), float(gaps[a, b])
 
 
 def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Adjusted:
@@ -559,18 +545,11 @@ def _validate(recording: WandRecording, solution: Solution) -> Solution:
     last = np.zeros(len(measured), bool)
     last[measured] = run % PARTS == PARTS - 1
     held_out = corrected.select(last[measured])
-    without = _adjust_without(solution, last) if last.any() else None
+    part = Estimate(adjusted.problem, adjusted.state, observations).select(~last[observations.row])
+    without = optimize(part.problem, part.observations, part.state) if part and last.any() else None
     return replace(
         solution,
         given=given.summary(),
         held_out=triangulated_residuals(held_out, without).summary() if without is not None else None,
         rejected_px=residuals[observations.row[~adjusted.used]],
     )
-
-
-def _adjust_without(solution: Solution, held_out: Mask) -> State | None:
-    """The state adjusted without some detections (n,) of the recording, from the state with them; None where fewer than
-    two frame sets remain."""
-    whole = Estimate(solution.adjusted.problem, solution.adjusted.state, solution.observations)
-    part = whole.select(~held_out[solution.observations.row])
-    return None if part is None else optimize(part.problem, part.observations, part.state)

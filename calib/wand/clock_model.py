@@ -37,7 +37,7 @@ from calib.wand.bundle_adjustment.problem import (
 from calib.wand.bundle_adjustment.residuals import find_weights, whitened_errors
 from calib.wand.detections import Timing
 from calib.wand.wand_report import ClockJump
-from camera_node.foundation.arrays import Array
+from camera_node.foundation.arrays import Array, Index
 
 MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
 # A jump that does not disturb the rig leaves neither: the rejected share of a camera's observations, and its drift,
@@ -167,10 +167,7 @@ class _ChangePoint:
 
 def _find_change(problem: Problem, observations: WandObservations, state: State, camera: int) -> _ChangePoint:
     """The best change of one camera's shift."""
-    rows = observations.select(np.flatnonzero(observations.camera == camera))
-    rows = rows.select(np.argsort(rows.t_s, kind="stable"))
-    frames, first = np.unique(rows.t_s, return_index=True)
-    frames, first = frames[MIN_FRAMES:-MIN_FRAMES], first[MIN_FRAMES:-MIN_FRAMES]
+    rows, frames, first = _inner_frames(observations, camera)
     if not len(frames):
         return _ChangePoint(camera, 0.0, 0.0, 0.0)
     total = np.cumsum(_deviations(problem, rows, state, camera), axis=1)
@@ -179,6 +176,15 @@ def _find_change(problem: Problem, observations: WandObservations, state: State,
     low, high = int(before[:, k].argmin()), int(after[:, k].argmin())
     gain = total[:, -1].min() - before[low, k] - after[high, k]
     return _ChangePoint(camera, float(frames[k]), float(SHIFTS[high] - SHIFTS[low]), float(gain))
+
+
+def _inner_frames(observations: WandObservations, camera: int) -> tuple[WandObservations, Array, Index]:
+    """One camera's observations by time, the stamps (f,) of its frames but for the first and the last `MIN_FRAMES`, and
+    the first observation (f,) of each."""
+    rows = observations.select(np.flatnonzero(observations.camera == camera))
+    rows = rows.select(np.argsort(rows.t_s, kind="stable"))
+    frames, first = np.unique(rows.t_s, return_index=True)
+    return rows, frames[MIN_FRAMES:-MIN_FRAMES], first[MIN_FRAMES:-MIN_FRAMES]
 
 
 def _deviations(problem: Problem, rows: WandObservations, state: State, camera: int) -> Array:
@@ -235,17 +241,14 @@ def _split(observations: WandObservations, camera: int, at_s: float, new: int) -
 
 def _find_boundary(problem: Problem, observations: WandObservations, state: State, camera: int) -> float:
     """The stamp before which a camera's observations fit its own state, and after which they fit the last camera's."""
-    rows = observations.select(np.flatnonzero(observations.camera == camera))
-    rows = rows.select(np.argsort(rows.t_s, kind="stable"))
-    frames, first = np.unique(rows.t_s, return_index=True)
+    rows, frames, first = _inner_frames(observations, camera)
     deviations = []
     for of in (camera, len(problem.lenses) - 1):
         as_camera = replace(rows, camera=np.full(len(rows), of))
         errors = whitened_errors(problem, as_camera, state, find_weights(problem, as_camera, state))
         deviations.append(np.minimum(np.linalg.norm(errors, axis=1), MAX_DEVIATION))
     gain = np.cumsum(deviations[0] - deviations[1])
-    inner = slice(MIN_FRAMES, len(frames) - MIN_FRAMES)
-    return float(frames[inner][gain[first[inner] - 1].argmin()])
+    return float(frames[gain[first - 1].argmin()])
 
 
 def _clock_difference(adjusted: Adjusted, camera: int, at_s: float) -> tuple[float, float]:

@@ -133,13 +133,14 @@ def _tabulate(pairs: TwoViewGeometry, a: int, b: int, grids: Array) -> _Table | 
         return None
     F = np.asarray(found, float)
     sigma = max(float(np.median(sampson(F, x_a, x_b))) / 0.6745, MIN_SIGMA_PX)
-    f_a, f_b = np.meshgrid(grids[a] * focal[0], grids[b] * focal[1], indexing="ij")
-    misfit = _Epipolar.of(x_a, x_b, f_a.ravel(), f_b.ravel(), sigma).fit(F)
-    return _Table(a, b, misfit.reshape(GRID, GRID))
+    f_a, f_b = (f.ravel() for f in np.meshgrid(grids[a] * focal[0], grids[b] * focal[1], indexing="ij"))
+    h_a, h_b = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
+    inverses = (np.eye(3) * np.column_stack([1 / f, 1 / f, np.ones(len(f))])[:, None] for f in (f_a, f_b))
+    return _Table(a, b, _EssentialMatrices(h_a, h_b, *inverses, sigma).fit(F).reshape(GRID, GRID))
 
 
 @dataclass(frozen=True, slots=True)
-class _Epipolar:
+class _EssentialMatrices:
     """The epipolar constraints of n images in two cameras, for g pairs of focal lengths.
 
     An essential matrix is U diag(1, 1, 0) V, of which a step turns U and V.
@@ -155,15 +156,6 @@ class _Epipolar:
     inverse_a: Array
     inverse_b: Array
     sigma: float
-
-    @classmethod
-    def of(cls, x_a: Array, x_b: Array, f_a: Array, f_b: Array, sigma: float) -> "_Epipolar":
-        """Those of pixels (n, 2) and focal lengths (g,)."""
-        h_a, h_b = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
-        inverse_a, inverse_b = (
-            np.eye(3) * np.column_stack([1 / f, 1 / f, np.ones(len(f))])[:, None] for f in (f_a, f_b)
-        )
-        return cls(h_a, h_b, inverse_a, inverse_b, sigma)
 
     def fit(self, F: Array) -> Array:
         """Half the least squared misfits (g,) under Cauchy's kernel, by Levenberg-Marquardt from the essential matrices

@@ -64,7 +64,7 @@ class CameraCovariance:
         free: indices of the d parameters (`calib.rig.camera`).
         noise: (C, d, C, d) the part from measurement noise, as the residuals show it.
         by_prior: (C, d, S d) P: change of each parameter when the given value of a parameter, last axis, is off by its
-            standard deviation (`Problem.covariance_prior_sigma`). P P^T is the part from priors: more recordings of the
+            standard deviation (`Problem.prior_sigma`). P P^T is the part from priors: more recordings of the
             wand do not reduce it.
         joint: (C, d, C, d) the sum of both.
     """
@@ -89,7 +89,7 @@ def camera_covariance(adjusted: Adjusted) -> CameraCovariance:
     problem, inverse, root = adjusted.problem, inverse_information(adjusted), _prior_root(adjusted)
     by_root = inverse * root
     noise = adjusted.scale**2 * adjusted.inflation * (inverse - by_root @ by_root.T)
-    given = problem.covariance_prior_sigma()[list(problem.estimated_cameras())].ravel()
+    given = problem.prior_sigma(of_covariance=True)[list(problem.estimated_cameras())].ravel()
     by_prior = _all_cameras(adjusted, inverse * (root**2 * np.where(root > 0, given, 0.0)), 1)
     noise = _all_cameras(adjusted, noise, 2)
     return CameraCovariance(

@@ -12,7 +12,6 @@ The motion is a chain, so its Hessian is block tridiagonal, and one factorizatio
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, cast
 
 import numpy as np
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
@@ -27,7 +26,6 @@ from calib.wand.bundle_adjustment.problem import (
     invert_information,
 )
 from calib.wand.bundle_adjustment.residuals import (
-    CameraPrior,
     Choice,
     ErrorNorms,
     LinearSystem,
@@ -342,17 +340,15 @@ def _solve_cameras(system: LinearSystem, information: Array, gradient: Array) ->
 
     free, estimated = list(system.problem.free), list(system.problem.estimated_cameras())
     d, graph, ordering = len(free), gtsam.GaussianFactorGraph(), gtsam.Ordering()
-    H, g = information.reshape(len(estimated), d, len(estimated), d), gradient.reshape(-1, d)
+    by_priors, prior_gradient = _prior_equations(system)
+    H = (information + by_priors).reshape(len(estimated), d, len(estimated), d)
+    g = (gradient + prior_gradient).reshape(-1, d)
     zero, none = np.zeros((d, d)), np.zeros(d)
     for k in range(len(estimated)):
         ordering.push_back(k)
         graph.push_back(gtsam.HessianFactor(k, H[k, :, k], g[k], 0.0))
     for a, b in combinations(range(len(estimated)), 2):  # only the sum of all is positive definite
         graph.push_back(gtsam.HessianFactor(a, b, zero, H[a, :, b], none, zero, none, 0.0))
-    for cameras, prior in _estimated_priors(system):
-        blocks = [part for block in zip(cameras, prior.jacobians, strict=True) for part in block]
-        unit = gtsam.noiseModel.Unit.Create(len(prior.error))
-        graph.push_back(cast(Any, gtsam.JacobianFactor)(*blocks, prior.error, unit))
     if system.problem.estimated is None:
         graph.push_back(gtsam.HessianFactor(0, np.diag(ANCHOR[free]), none, 0.0))
     step = graph.optimize(ordering)
@@ -559,24 +555,11 @@ def _sum_camera_hessians(system: LinearSystem, local: int) -> Array:
     return own
 
 
-def _estimated_priors(system: LinearSystem) -> Iterator[tuple[list[int], CameraPrior]]:
-    """The priors of estimated cameras, and the places of their cameras among the estimated ones."""
-    place = {camera: k for k, camera in enumerate(system.problem.estimated_cameras())}
-    for prior in system.priors:
-        if place.keys() >= set(prior.cameras):
-            yield [place[camera] for camera in prior.cameras], prior
-
-
 def _prior_equations(system: LinearSystem) -> tuple[Array, Array]:
     """(S d, S d) information and (S d,) gradient of the priors of the estimated cameras."""
-    S, d = len(system.problem.estimated_cameras()), len(system.problem.free)
-    H, g = np.zeros((S, d, S, d)), np.zeros((S, d))
-    for cameras, prior in _estimated_priors(system):
-        for a, J_a in zip(cameras, prior.jacobians, strict=True):
-            g[a] += J_a.T @ prior.error
-            for b, J_b in zip(cameras, prior.jacobians, strict=True):
-                H[a, :, b] += J_a.T @ J_b
-    return H.reshape(S * d, S * d), g.ravel()
+    d, (information, gradient) = len(system.problem.free), system.priors
+    rows = np.ravel(np.array(system.problem.estimated_cameras(), np.intp)[:, None] * d + np.arange(d))
+    return information[np.ix_(rows, rows)], gradient[rows]
 
 
 def _equal_blocks(rows: Array, bounds: Index) -> Iterator[tuple[Index, Array]]:

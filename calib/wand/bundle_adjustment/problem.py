@@ -195,20 +195,14 @@ class Problem:
     drift_sigma: float = SLEWED_DRIFT
     background: BackgroundPoints = field(default_factory=BackgroundPoints.none)
 
-    def prior_sigma(self) -> Array:
-        """(C, d) prior standard deviations of the free parameters in the estimate; infinite for poses."""
-        return self._prior_sigma(self.lens_sigma)
-
-    def covariance_prior_sigma(self) -> Array:
-        """(C, d) prior standard deviations of the free parameters for the covariance."""
-        return self._prior_sigma(
-            self.lens_sigma if self.covariance_lens_sigma is None else self.covariance_lens_sigma
-        )
-
-    def _prior_sigma(self, lens_sigma: Array) -> Array:
+    def prior_sigma(self, of_covariance: bool = False) -> Array:
+        """(C, d) prior standard deviations of the free parameters in the estimate, or for the covariance; infinite for
+        poses."""
+        given = self.covariance_lens_sigma if of_covariance else None
         clocks = [*OFFSET_SIGMA, self.drift_sigma, READOUT_SIGMA]
         others = np.tile(POSE_SIGMA + clocks, (len(self.lenses), 1))
-        return np.concatenate([others, lens_sigma], axis=1)[:, self.free]
+        lenses = self.lens_sigma if given is None else given
+        return np.concatenate([others, lenses], axis=1)[:, self.free]
 
     def estimated_cameras(self) -> tuple[int, ...]:
         """Indices of the S cameras that are estimated."""

@@ -187,33 +187,28 @@ def motion_errors(problem: Problem, state: State, weights: Weights) -> tuple[Arr
     return smooth, (lengths - wand.lengths) / LENGTH_SIGMA_M, motion[:, 1] / SPEED_SIGMA
 
 
-@dataclass(frozen=True, slots=True)
-class CameraPrior:
-    """A linearized prior factor on one or two `cameras`: whitened `jacobians` (r, d), one a camera, and minus the
-    whitened `error` (r,)."""
+def camera_priors(problem: Problem, state: State) -> tuple[Array, Array, float]:
+    """The priors of all cameras' free parameters, and of the distance that fixes the scale, at a state.
 
-    cameras: tuple[int, ...]
-    jacobians: tuple[Array, ...]
-    error: Array
-
-
-def camera_priors(problem: Problem, state: State) -> list[CameraPrior]:
-    """The priors of all cameras' free parameters, and of the distance that fixes the scale, at a state."""
+    Returns:
+        their information (C d, C d), their gradient (C d,), and the sum of their squared errors in sigmas.
+    """
     free, poses = list(problem.free), np.zeros((len(state.cameras), len(POSE)))
-    values = np.column_stack([poses, state.clocks, state.lenses])[:, free]
-    priors = [
-        CameraPrior((c,), (np.diag(1 / sigma),), -value / sigma)
-        for c, (value, sigma) in enumerate(zip(values, problem.prior_sigma(), strict=True))
-    ]
+    values = np.column_stack([poses, state.clocks, state.lenses])[:, free].ravel()
+    sigma = problem.prior_sigma().ravel()
+    information, gradient = np.diag(sigma**-2), -values / sigma**2
+    squares = float(((values / sigma) ** 2).sum())
     if problem.fixed_distance:
         a, b, distance = problem.fixed_distance
         gap = state.cameras[a, :3, 3] - state.cameras[b, :3, 3]
         along = gap / np.linalg.norm(gap) / distance / SCALE_SIGMA
-        J = np.zeros((2, 1, len(free)))
-        J[0, 0, 3:6], J[1, 0, 3:6] = along @ state.cameras[a, :3, :3], -along @ state.cameras[b, :3, :3]
-        error = np.array([1 - float(np.linalg.norm(gap)) / distance]) / SCALE_SIGMA
-        priors.append(CameraPrior((a, b), tuple(J), error))
-    return priors
+        J = np.zeros((len(state.cameras), len(free)))
+        J[a, 3:6], J[b, 3:6] = along @ state.cameras[a, :3, :3], -along @ state.cameras[b, :3, :3]
+        error = (1 - float(np.linalg.norm(gap)) / distance) / SCALE_SIGMA
+        information += np.outer(J, J)
+        gradient += J.ravel() * error
+        squares += error**2
+    return information, gradient, squares
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,9 +246,8 @@ def error_norms(
     smooth, lengths, speed = motion_errors(problem, state, weights)
     size = 6 * len(problem.wand.basis)
     interval = np.sqrt((smooth**2).sum(axis=(1, 2, 3)) / size)
-    priors = (prior.error for prior in camera_priors(problem, state))
     beside = point_error_norms(problem, state)[weights.background]
-    rest = sum((term**2).sum() for term in (lengths, speed, beside, *priors))
+    rest = sum((term**2).sum() for term in (lengths, speed, beside)) + camera_priors(problem, state)[2]
     pixel = whitened_errors(problem, observations, state, weights)
     return ErrorNorms(np.linalg.norm(pixel, axis=1), interval, size, float(rest))
 
@@ -272,7 +266,7 @@ class LinearSystem:
             interval k, the last knot's in the last interval.
         motion_prior: (L, 12 B + 1, 12 B + 1) the part of `chain` from the prior of the motion: constant velocity and
             zero speed.
-        priors: of the cameras.
+        priors: information (C d, C d) and gradient (C d,) of the priors of all cameras.
         by_points, point_scores: (C, d, C, d) information of all background points on the cameras, and (J, C, d)
             gradients by point, the points eliminated.
     """
@@ -283,7 +277,7 @@ class LinearSystem:
     bounds: Index
     chain: Array
     motion_prior: Array
-    priors: list[CameraPrior]
+    priors: tuple[Array, Array]
     by_points: Array
     point_scores: Array
 
@@ -311,7 +305,7 @@ def linearize(
         bounds=2 * np.append(first, len(view)),
         chain=motion_prior + _linearize_lengths(problem, state),
         motion_prior=motion_prior,
-        priors=camera_priors(problem, state),
+        priors=camera_priors(problem, state)[:2],
         by_points=by_points,
         point_scores=point_scores,
     )

@@ -58,7 +58,7 @@ class CameraPoses:
         by_prior = by_prior[:, pose][:, :, :, lens]
         by_lens = by_prior.reshape(6 * count, len(LENS) * count)
         rest = result.covariance - by_lens @ by_lens.T
-        sigma = adjusted.problem.covariance_prior_sigma()[:, lens]
+        sigma = adjusted.problem.prior_sigma(of_covariance=True)[:, lens]
         lenses = {
             name: (by_prior[:, :, k].reshape(6 * count, len(LENS)) / sigma[k], sigma[k])
             for k, name in enumerate(result.names)
