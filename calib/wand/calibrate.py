@@ -18,7 +18,7 @@ from calib.rig.camera import LENS, POSE
 from calib.rig.rig import Rig
 from calib.rig.wand_file import check_diameter
 from calib.wand.alignment import Alignment, align_clocks
-from calib.wand.bundle_adjustment.covariance import estimate_lens_priors, inflate_covariance
+from calib.wand.bundle_adjustment.covariance import estimate_lens_priors
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.optimizer import adjust, optimize, optimize_robustly
 from calib.wand.bundle_adjustment.problem import (
@@ -438,7 +438,6 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
     """
     coarse = adjust_coarsely(recording, rough)
     check_lenses(recording.names, coarse)
-    coarse = inflate_covariance(coarse)
     check_mirrored(recording.wand, coarse)
     clocks = choose_clocks(coarse, recording.timing)
     fine = _prepare_fine(recording, rough, coarse, clocks)
@@ -447,7 +446,6 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
     if rough.metric:
         check_sizes(recording.wand, solution.adjusted, solution.observations)
         check_spacing(recording.wand, solution.adjusted, solution.observations)
-    solution = replace(solution, adjusted=inflate_covariance(solution.adjusted))
     return _validate(recording, solution)
 
 

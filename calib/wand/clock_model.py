@@ -20,8 +20,6 @@ from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT
 from calib.rig.estimation import CHANCE, CLEAR
 from calib.wand.bundle_adjustment.covariance import (
     camera_covariance,
-    inflate_covariance,
-    inflation_factor,
     inverse_information,
 )
 from calib.wand.bundle_adjustment.optimizer import adjust, optimize_robustly, with_information
@@ -99,7 +97,6 @@ def with_readout_times(adjusted: Adjusted, observations: WandObservations, timin
     """
     if timing.synchronous:
         return adjusted
-    adjusted = replace(adjusted, inflation=inflation_factor(adjusted))
     cameras = list(adjusted.problem.estimated_cameras())
     problem = adjusted.problem.with_free(adjusted.problem.free, READOUT)
     predicted = with_information(adjusted, problem, observations)
@@ -109,7 +106,6 @@ def with_readout_times(adjusted: Adjusted, observations: WandObservations, timin
     clocks = adjusted.state.clocks.copy()
     clocks[cameras, 2] = readout_s
     found = adjust(problem, observations, replace(adjusted.state, clocks=clocks))
-    found = replace(found, inflation=inflation_factor(found))
     return found if _has_readout(found.state.clocks[cameras, 2], found, timing) else adjusted
 
 
@@ -225,7 +221,7 @@ def _confirm(
     start = optimize_robustly(two, _split(observations, camera, change.t_s, after), start)
     # The first time is found along a motion that is adjusted to both parts of the clock.
     at_s = _find_boundary(two, observations, start, camera)
-    adjusted = inflate_covariance(adjust(two, _split(observations, camera, at_s, after), start))
+    adjusted = adjust(two, _split(observations, camera, at_s, after), start)
     jump, variance = _clock_difference(adjusted, camera, at_s)
     by_chance = chdtrc(1, jump**2 / variance) * len(observations)
     if by_chance > CHANCE or not 1 / AGREEMENT < -jump / change.by_s < AGREEMENT:

@@ -13,7 +13,6 @@ from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import (
     camera_covariance,
     estimate_lens_priors,
-    inflate_covariance,
 )
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.optimizer import adjust, optimize_robustly
@@ -136,10 +135,10 @@ def _adjust(recording: WandRecording, start: Estimate, this: int) -> Solution:
     state = optimize_robustly(problem, start.observations, start.state)
     observations = with_disc_centres(problem, state, start.observations, recording.wand)
     first = adjust(problem.with_free(POSE, clock, LENS), observations, state)
-    first = inflate_covariance(with_readout_times(first, observations, recording.timing))
+    first = with_readout_times(first, observations, recording.timing)
     check_lenses(recording.names, first)
     problem = estimate_lens_priors(first.problem, first)
-    adjusted = inflate_covariance(adjust(problem, observations, first.state))
+    adjusted = adjust(problem, observations, first.state)
     check_agreement(recording.names, adjusted, observations)
     return Solution(adjusted, observations)
 

@@ -117,11 +117,6 @@ def _all_cameras(adjusted: Adjusted, part: Array, axes: int) -> Array:
     return full
 
 
-def inflate_covariance(adjusted: Adjusted) -> Adjusted:
-    """The adjustment with the inflation of its covariance that the correlation of its residuals requires."""
-    return replace(adjusted, inflation=inflation_factor(adjusted))
-
-
 def inflation_factor(adjusted: Adjusted) -> float:
     """The factor of the covariance for residuals correlated in time, at least 1: the estimated motion absorbs errors,
     so an estimate below 1 means nothing."""

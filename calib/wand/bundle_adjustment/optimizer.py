@@ -18,6 +18,7 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from calib.rig.camera import PER_CAMERA, READOUT
 from calib.rig.estimation import CAUCHY_SCALE, GROSS, coordinate_sigma
+from calib.wand.bundle_adjustment.covariance import inflation_factor
 from calib.wand.bundle_adjustment.problem import (
     Adjusted,
     Problem,
@@ -78,7 +79,7 @@ def adjust(
     state, choice, weights = _optimize_exactly(problem, observations, start, rounds)
     inliers = observations.select(choice.observations)
     cameras = profile_motion(linearize(problem, inliers, state, weights))
-    return Adjusted(
+    adjusted = Adjusted(
         problem=problem,
         state=state,
         used=choice.observations,
@@ -88,6 +89,7 @@ def adjust(
         scores=cameras.scores,
         background_used=choice.background,
     )
+    return replace(adjusted, inflation=inflation_factor(adjusted))
 
 
 def with_information(adjusted: Adjusted, problem: Problem, observations: WandObservations) -> Adjusted:
