@@ -135,8 +135,11 @@ def _tabulate(pairs: TwoViewGeometry, a: int, b: int, grids: Array) -> _Table | 
     sigma = max(float(np.median(sampson(F, x_a, x_b))) / 0.6745, MIN_SIGMA_PX)
     f_a, f_b = (f.ravel() for f in np.meshgrid(grids[a] * focal[0], grids[b] * focal[1], indexing="ij"))
     h_a, h_b = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
-    inverses = (np.eye(3) * np.column_stack([1 / f, 1 / f, np.ones(len(f))])[:, None] for f in (f_a, f_b))
-    return _Table(a, b, _EssentialMatrices(h_a, h_b, *inverses, sigma).fit(F).reshape(GRID, GRID))
+    inverse_a, inverse_b = (
+        np.eye(3) * np.column_stack([1 / f, 1 / f, np.ones(len(f))])[:, None] for f in (f_a, f_b)
+    )
+    matrices = _EssentialMatrices(h_a, h_b, inverse_a, inverse_b, sigma)
+    return _Table(a, b, matrices.fit(F).reshape(GRID, GRID))
 
 
 @dataclass(frozen=True, slots=True)
