@@ -3,8 +3,9 @@
 
 import functools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import msgspec
 import numpy as np
@@ -19,6 +20,7 @@ from tests.benchmarks.fusion_load import START_NS, Load
 StampError = Callable[[float], float]  # of a camera's stamps, s, at the true time in s
 GRACE_S = 0.1  # after a step, in which poses may be wrong
 LAG_S, JITTER_S = 0.012, 0.003  # from exposure to arrival: constant, and mean of an exponential distribution
+LONGEST_S = 3600.0
 SIGMAS, ERROR_M = 5.0, 0.01  # a pose in state "tracked" is wrong beyond both
 
 
@@ -32,10 +34,18 @@ def drift(at_s: float, ppm: float) -> StampError:
     return lambda t_s: max(t_s - at_s, 0.0) * ppm * 1e-6
 
 
-@functools.lru_cache(maxsize=2)
-def detections(load: Load, seconds: float) -> tuple[Detections, ...]:
-    """The messages of a load; its detections are the same whatever the clocks stamp."""
-    return tuple(load.messages(seconds))
+@functools.lru_cache(maxsize=4)
+def _begun(load: Load) -> tuple[list[Detections], Iterator[Detections]]:
+    return [], load.messages(LONGEST_S)
+
+
+def detections(load: Load, seconds: float) -> list[Detections]:
+    """The messages of a load, which are the same whatever the clocks stamp, and of which a shorter time has the first
+    ones."""
+    known, later = _begun(load)
+    n = round(seconds * load.hz) * load.cameras
+    known.extend(islice(later, max(0, n - len(known))))
+    return known[:n]
 
 
 def arrivals(

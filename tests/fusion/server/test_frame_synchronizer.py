@@ -12,6 +12,7 @@ from fusion.model.limits import Limits
 from fusion.model.undistortion import N_ROWS
 from fusion.server.frame_synchronizer import SILENT_NS, FrameSynchronizer
 
+pytestmark = pytest.mark.computed
 PERIOD = 33_333_333
 MS = 1_000_000
 TICK = 5 * MS

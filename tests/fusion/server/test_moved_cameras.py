@@ -15,6 +15,7 @@ from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.faults.world import CameraFault
 from tests.benchmarks.fusion_load import Load
 
+pytestmark = pytest.mark.computed
 TURNS = [
     (0.04, -0.03, 0.02),
     (-0.03, 0.02, 0.04),
@@ -47,12 +48,15 @@ def is_calibrated(arena: VirtualArena, camera: str) -> bool:
     return arena.server.pipeline.cameras[camera].T_world_cam == arena.load.rig[camera].T_world_cam
 
 
-def test_a_camera_that_returns_has_its_calibrated_pose_however_often_it_was_moved(arena: VirtualArena):
+@pytest.mark.parametrize("times", [2, pytest.param(len(TURNS), marks=pytest.mark.slow)])
+def test_a_camera_that_returns_has_its_calibrated_pose_however_often_it_was_moved(
+    arena: VirtualArena, times: int
+):
     """Also if the server restarted: it reads the poses before its corrections from the history of the rig."""
-    for k, turned in enumerate(TURNS):
+    for k, turned in enumerate(TURNS[:times]):
         assert any("recalibrated" in line for line in turn(arena, "cam1", turned))
         assert not is_calibrated(arena, "cam1")
-        if k == len(TURNS) - 1:
+        if k == times - 1:
             arena.restart()
             arena.wait(2.0)
         assert any("known pose" in line for line in turn(arena, "cam1", (0.0, 0.0, 0.0)))

@@ -13,14 +13,12 @@ from tests.benchmarks.faults.judge import MAX_ERROR_M
 from tests.benchmarks.faults.live_clocks import drift_live, set_system_clock
 
 
-@pytest.mark.parametrize(
-    "step_s", [0.5, -3600.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (-0.5, 3600.0))]
-)
-def test_no_pose_changes_when_the_system_clock_is_set(tmp_path: Path, step_s: float):
-    """Server and cameras are programs whose system clock is set while a robot drives at 0.94 m/s."""
-    (judged,) = set_system_clock(tmp_path, (step_s,))
-    assert judged.worst_m < MAX_ERROR_M
-    assert judged.share > 1 / 3  # on a busy machine frames may be late
+@pytest.mark.parametrize("ahead_s", [(0.5, -3600.0), pytest.param((-0.5, 3600.0), marks=pytest.mark.slow)])
+def test_no_pose_changes_when_the_system_clock_is_set(tmp_path: Path, ahead_s: tuple[float, ...]):
+    """Server and cameras are programs whose system clock is set twice while a robot drives at 0.94 m/s."""
+    for judged in set_system_clock(tmp_path, ahead_s):
+        assert judged.worst_m < MAX_ERROR_M
+        assert judged.share > 1 / 3  # on a busy machine frames may be late
 
 
 def test_the_time_is_unix_time_at_the_start_and_monotonic_since():
