@@ -16,6 +16,7 @@ from camera_node.geometry.lens import Lens
 # logarithm of the focal length.
 ERRORS = 8
 PARAMETERS = (*POSE, *OFFSET, LENS[0])  # the same, as `calib.rig.camera` numbers them
+POSITION = slice(3, 6)
 OF_IMAGE = np.arange(ERRORS) != 6  # all but the clock's displace the image of a point at rest
 MAX_JOINT = 16  # cameras whose covariances between each other fit into a rig's message: 16,384 numbers
 DIGITS = 6  # of a number in the file
@@ -52,7 +53,7 @@ def with_errors(cameras: Mapping[str, Camera], covariance: Array) -> dict[str, C
     them beyond `MAX_JOINT` cameras."""
     n = len(cameras)
     if n > MAX_JOINT:
-        full = np.array([covariance_factor(block) for block in _own_blocks(covariance)]).reshape(
+        full = np.array([covariance_factor(block) for block in own_blocks(covariance)]).reshape(
             n * ERRORS, ERRORS
         )
     else:
@@ -94,8 +95,8 @@ def covariance_factor(covariance: Array) -> Array:
     return scale[:, None] * np.asarray(np.linalg.qr(root.T, mode="r"), float).T
 
 
-def _own_blocks(covariance: Array) -> Array:
-    """(C, 8, 8) covariances of single cameras."""
+def own_blocks(covariance: Array) -> Array:
+    """(C, 8, 8) covariances of single cameras, of a joint one (8 C, 8 C)."""
     n = len(covariance) // ERRORS
     return np.einsum("kikj->kij", covariance.reshape(n, ERRORS, n, ERRORS))
 
@@ -108,17 +109,30 @@ def usual_covariance(camera: Camera, range_m: float, error_px: float = USUAL_PX)
 
 def image_errors(cameras: Sequence[Camera], covariance: Array) -> Array:
     """(C,) RMS errors of the images by the errors of their cameras (8 C, 8 C), pixels, for each coordinate."""
-    found = []
+    return np.sqrt(np.einsum("kij,kij->k", image_metrics(cameras), own_blocks(covariance)))
+
+
+def image_metrics(cameras: Sequence[Camera]) -> Array:
+    """(C, 8, 8) M with e^T M e the mean square, px^2, of what errors e (8,) of a camera displace a coordinate of the
+    image of a point at rest."""
+    found = np.zeros((len(cameras), ERRORS, ERRORS))
+    own = np.flatnonzero(OF_IMAGE)
     for k, (camera, range_m) in enumerate(zip(cameras, working_ranges(cameras).tolist(), strict=True)):
         v, u = np.meshgrid(GRID * camera.height, GRID * camera.width, indexing="ij")
         rays = camera.rays(np.column_stack([u.ravel(), v.ravel()]))
         rays = rays[np.isfinite(rays).all(axis=1)]
         _, _, J_pose, J_lens = pixel_jacobians(camera, range_m * rays)
         J = np.concatenate([J_pose, J_lens[:, :, :1]], axis=2)
-        own = np.flatnonzero(OF_IMAGE) + ERRORS * k
-        squares = np.einsum("nai,ij,naj->n", J, covariance[np.ix_(own, own)], J)
-        found.append(np.sqrt(squares.mean() / 2) if len(squares) else 0.0)
-    return np.array(found)
+        if len(J):
+            found[k][np.ix_(own, own)] = np.einsum("nai,naj->ij", J, J) / (2 * len(J))
+    return found
+
+
+def errors_of_size(T: Array) -> Array:
+    """(8 C,) the errors of cameras at poses T_world_cam (C, 4, 4), by the logarithm of the size of their arena."""
+    grown = np.zeros((len(T), ERRORS))
+    grown[:, POSITION] = np.einsum("kji,kj->ki", T[:, :3, :3], T[:, :3, 3])
+    return grown.ravel()
 
 
 def working_ranges(cameras: Sequence[Camera]) -> Array:

@@ -12,7 +12,7 @@ from calib.rig.rig_messages import RigVersion
 from camera_node.foundation.errors import printable
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
-from fusion.model.corrections import corrected_camera
+from fusion.model.corrections import corrected_cameras
 
 
 def history(
@@ -47,9 +47,10 @@ def undo(
     *,
     connection: ConnectionOptions = LOCAL_SERVER,
 ) -> int:
-    """Undo the last change of the running server's rig: a calibration, or its recalibration of a moved camera.
+    """Undo the last change of the running server's rig: a calibration, or its own correction of cameras.
 
-    A camera whose recalibration is undone is no longer monitored.
+    A camera whose recalibration is undone is no longer monitored, and a rig whose refinement is undone is not refined
+    any more.
 
     Args:
         connection: the arena's server.
@@ -80,6 +81,9 @@ def _take(session: zenoh.Session, arena: str, step: Step) -> str:
     old = before.cameras if before else {}
     changed = [name for name in {**old, **after.cameras} if old.get(name) != after.cameras.get(name)]
     text = f"{history.describe_step(step)}; changed cameras: {', '.join(changed) or 'none'}"
-    if step == "undo" and before and (name := corrected_camera(before, after)):
-        text += f"; {name} is no longer monitored"
+    corrected = corrected_cameras(before, after) if step == "undo" and before else []
+    if len(corrected) == 1:
+        text += f"; {corrected[0]} is no longer monitored"
+    elif corrected:
+        text += "; the rig is not refined any more, until it is calibrated or the server starts again"
     return text

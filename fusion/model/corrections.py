@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The server's corrections of moved cameras, as recorded in the `calibration` map of a rig: both the server and its
+"""The server's corrections of cameras, as recorded in the `calibration` map of a rig: both the server and its
 clients read them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import msgspec
+import numpy as np
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
 
-CORRECTED = "corrected"  # the entry of the camera that was corrected last
+CORRECTED = "corrected"  # the entry of the cameras that were corrected last, and when
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,13 +30,44 @@ class ExtrinsicsCorrection:
     has_returned: bool = False
     rig: Mapping[str, Camera] = field(default_factory=dict)
 
+    @property
+    def placed(self) -> Mapping[str, Camera]:
+        """The cameras that have another pose."""
+        return {} if self.camera is None else {self.name: self.camera}
 
-def correct(rig: Rig, correction: ExtrinsicsCorrection, t_ns: int) -> Rig:
-    """The rig with a camera that the server recalibrated at `t_ns`."""
-    calibration = rig.calibration | {CORRECTED: {"camera": correction.name, "t_ns": t_ns}}
-    cameras = with_errors_of(rig.cameras, correction.rig)
-    if correction.camera is not None:
-        cameras[correction.name] = correction.camera
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigRefinement:
+    """The poses and lenses of all cameras are known better than by the calibration.
+
+    Attributes:
+        rig: all cameras in use, with their errors from now on.
+        errors_px: by which the images of each camera were off, RMS of a coordinate.
+        errors: (8,) of the camera that was off most (`calib.rig.camera_errors`).
+    """
+
+    rig: Mapping[str, Camera]
+    errors_px: Mapping[str, float]
+    errors: tuple[float, ...]
+
+    @property
+    def placed(self) -> Mapping[str, Camera]:
+        """The cameras that have another pose or lens."""
+        return self.rig
+
+    def __str__(self) -> str:
+        worst = max(self.errors_px, key=self.errors_px.__getitem__)
+        turn, shift = np.degrees(np.linalg.norm(self.errors[:3])), 1e3 * np.linalg.norm(self.errors[3:6])
+        return (
+            f"the rig is refined by up to {self.errors_px[worst]:.2f} px: camera {worst} by {turn:.3f} degrees, "
+            f"{shift:.1f} mm and {100 * self.errors[7]:+.2f} % of its focal length"
+        )
+
+
+def correct(rig: Rig, correction: ExtrinsicsCorrection | RigRefinement, t_ns: int) -> Rig:
+    """The rig with the cameras that the server recalibrated at `t_ns`."""
+    calibration = rig.calibration | {CORRECTED: {"cameras": sorted(correction.placed), "t_ns": t_ns}}
+    cameras = {**with_errors_of(rig.cameras, correction.rig), **correction.placed}
     return msgspec.structs.replace(rig, cameras=cameras, calibration=calibration)
 
 
@@ -50,17 +81,19 @@ def with_errors_of(cameras: Mapping[str, Camera], others: Mapping[str, Camera]) 
     return {**cameras, **changed}
 
 
-def corrected_camera(undone: Rig, restored: Rig) -> str | None:
-    """The camera whose correction an undo reverts; None if a user made the change."""
-    was, name = _correction(undone), _correction(undone).get("camera")
-    return name if was != _correction(restored) and name in restored.cameras else None
+def corrected_cameras(undone: Rig, restored: Rig) -> list[str]:
+    """The cameras whose correction an undo reverts, all of a refinement; none if a user made the change."""
+    if undone.calibration.get(CORRECTED) == restored.calibration.get(CORRECTED):
+        return []
+    return [name for name in _corrected(undone) if name in restored.cameras]
 
 
 def is_corrected(rig: Rig) -> bool:
     """Whether the server corrected a camera since the calibration."""
-    return bool(_correction(rig))
+    return bool(_corrected(rig))
 
 
-def _correction(rig: Rig) -> dict[str, Any]:
+def _corrected(rig: Rig) -> list[str]:
     entry = rig.calibration.get(CORRECTED)  # from a file or a message: of any type
-    return entry if isinstance(entry, dict) and isinstance(entry.get("camera"), str) else {}
+    names = entry.get("cameras", [entry.get("camera")]) if isinstance(entry, dict) else None
+    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []

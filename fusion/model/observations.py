@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.camera import Camera
-from calib.rig.camera_errors import error_covariance, image_errors
+from calib.rig.camera_errors import error_covariance, errors_of_size, image_errors
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.foundation.columns import Columns
 from camera_node.geometry.outline import half_axes_of
@@ -128,13 +128,14 @@ class CameraArray:
         error_px: (C,) what these errors displace in the images, RMS of a coordinate, at most `MAX_ERROR_PX`: by these,
             detections are weighed, associated and searched.
         error_scale: factor of the standard deviations that the rig states.
+        size_error: of the whole rig, relative; errors of its size are counted beside those that it states.
         revision: counts the changes of camera poses and of their errors.
     """
 
     def __init__(self, cameras: dict[str, Camera], error_scale: float = 1.0) -> None:
         self.names = tuple(cameras)
         self.index = {name: k for k, name in enumerate(cameras)}
-        self._cameras, self.error_scale = dict(cameras), error_scale
+        self._cameras, self.error_scale, self.size_error = dict(cameras), error_scale, 0.0
         self.revision = 0
         for camera in cameras.values():
             table_of(camera)  # so that the first frame does not wait for it
@@ -147,9 +148,9 @@ class CameraArray:
         """A copy of all cameras by name."""
         return dict(self._cameras)
 
-    def place(self, name: str, camera: Camera) -> None:
-        """Replace the pose of a camera."""
-        self._cameras[name] = camera
+    def place(self, cameras: Mapping[str, Camera]) -> None:
+        """Replace the poses of cameras."""
+        self._cameras |= cameras
         self.revision += 1
         self._update()
 
@@ -160,10 +161,10 @@ class CameraArray:
             self.revision += 1
             self._update()
 
-    def scale_errors(self, scale: float) -> None:
-        """Count the errors that the rig states this many times as large."""
-        if scale != self.error_scale:
-            self.error_scale = scale
+    def count_errors(self, scale: float, size_error: float) -> None:
+        """Count the errors that the rig states this many times as large, and an error of its size."""
+        if (scale, size_error) != (self.error_scale, self.size_error):
+            self.error_scale, self.size_error = scale, size_error
             self.revision += 1
             self._update()
 
@@ -173,7 +174,8 @@ class CameraArray:
         self.R_cam_world = np.ascontiguousarray(T[:, :3, :3].transpose(0, 2, 1))
         self.centres = np.ascontiguousarray(T[:, :3, 3])
         self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
-        self.covariance = self.error_scale**2 * error_covariance(list(cameras))
+        of_size = self.size_error * errors_of_size(T)
+        self.covariance = self.error_scale**2 * error_covariance(list(cameras)) + np.outer(of_size, of_size)
         self.error_px = np.minimum(image_errors(list(cameras), self.covariance), MAX_ERROR_PX)
 
     def frame_poses(self, states: States, exposures: Exposures) -> _core.FramePoses:

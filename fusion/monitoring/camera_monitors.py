@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from calib.rig.camera import Camera
-from fusion.model.corrections import ExtrinsicsCorrection
+from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import Snapshot
@@ -68,15 +68,15 @@ class CameraMonitors:
         recalibrates: bool,
         is_doubtful: bool,
         displaced: Mapping[int, int],
-    ) -> tuple[ExtrinsicsCorrection, ...]:
+    ) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         """Exclude moved cameras, apply recalibrated poses and correct clocks; see `RigMonitor.check`."""
         corrections = self.rig.check(frame_set, now, recalibrates, is_doubtful, displaced)
         for departure in self.rig.take_departures():
             self.clocks.correct(departure)
         self.clocks.hold_common_rate(frame_set.t_ns)
         for correction in corrections:
-            if correction.camera is not None:
-                self._cameras.place(correction.name, correction.camera)
+            if correction.placed:
+                self._cameras.place(correction.placed)
                 self._cameras.state_errors(correction.rig)
         return corrections
 
@@ -84,5 +84,5 @@ class CameraMonitors:
         """Replace the pose of a camera and use its detections; a pinned camera is not excluded again."""
         if camera.clock != self._cameras[name].clock:
             self.clocks.reset(name)
-        self._cameras.place(name, camera)
+        self._cameras.place({name: camera})
         (self.rig.pin if pinned else self.rig.readmit)(name)

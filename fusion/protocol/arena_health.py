@@ -112,6 +112,8 @@ def describe_contradiction(contradiction: Contradiction) -> str:
         return f"camera {names} contradicts the other cameras {size}: {cause}; calibrate it again"
     if contradiction.kind == "robot":
         return f"robot {names}: its markers are not where robots.yaml has them, {size}; measure it again"
+    if contradiction.kind == "wand":
+        return f"the rig and all robots differ in size {size}; measure the wand and the markers, and calibrate again"
     cause = "which one is wrong is undecided, or the lenses or the wand's lengths are"
     return f"cameras {names} contradict each other {size}: {cause}; calibrate again"
 

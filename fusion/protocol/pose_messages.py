@@ -331,13 +331,13 @@ class Contradiction(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         kind: "camera": all fits without it; "robot": the others of its cameras fit; "undecided": no single camera
-            explains it, or several do.
+            explains it, or several do; "wand": the whole rig has another size than the robots.
         names: the camera, the robot, or the cameras that contradict each other.
         error_over_claim: squared residuals over their expectation, of the robot that contradicts most.
         size_mm: of the errors at the robots, RMS.
     """
 
-    kind: Literal["camera", "robot", "undecided"]
+    kind: Literal["camera", "robot", "undecided", "wand"]
     names: tuple[str, ...]
     error_over_claim: float
     size_mm: float

@@ -21,7 +21,7 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.sources.recorded_detections import detect_frames, read_observations
 from fusion.errors import FusionError
-from fusion.model.corrections import ExtrinsicsCorrection
+from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.robots import Robot
@@ -93,8 +93,11 @@ class Summary:
             self.unused[name] += use.unused
             self.squared_px[name] = self.squared_px.get(name, 0.0) + use.squared_px
 
-    def add_correction(self, correction: ExtrinsicsCorrection, t_ns: int) -> None:
-        """Note that a camera was moved, or recalibrated after a move."""
+    def add_correction(self, correction: ExtrinsicsCorrection | RigRefinement, t_ns: int) -> None:
+        """Note that a camera was moved, or recalibrated after a move, or that all are known better."""
+        if isinstance(correction, RigRefinement):
+            self.moves.append(f"{correction}, at t_ns {t_ns}; the rig file is unchanged")
+            return
         if correction.camera is None:
             event = f"seen at t_ns {t_ns}; its detections are excluded from then on"
         else:

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtri, exp1
 
-from calib.rig.camera_errors import ERRORS
+from calib.rig.camera_errors import ERRORS, errors_of_size
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
@@ -27,9 +27,11 @@ from fusion.model.states import OMEGA, VELOCITY, States
 
 # The errors of a camera by their columns (`calib.rig.camera_errors`).
 CAUSES: dict["Cause", slice] = {"pose": slice(0, 6), "clock": slice(6, 7), "focal": slice(7, 8)}
-Cause = Literal["pose", "clock", "focal"]
-# Standard deviations of errors that a hypothesis frees: weak, they only keep the system regular.
-FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [1.0, 0.1])
+Cause = Literal["pose", "clock", "focal", "wand"]
+# Standard deviations of errors that a hypothesis frees: weak, they only keep the system regular. Arrivals show larger
+# jumps of a clock.
+FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [0.1, 0.1])
+WAND_SIGMA = 0.05  # of the rig's size, if the lengths of the wand are wrong
 POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
 RIVAL = 1e-3  # likelihood of another explanation, relative to the accepted one
@@ -53,6 +55,8 @@ class Window:
         since: (8 C,) variances of what changed since then: clocks and lenses.
         states: B bodies, with velocities that do not depend on single frames.
         velocity_sigma: (B, 2) of these: angular and linear, rad/s and m/s.
+        moving: (B,) whether that is more than noise. The others show no clock: if noise is their velocity, a clock that
+            is off by a second explains anything.
         single: (B,) bodies with one marker.
         observations: N detections of all keyframes with their discs.
         by_focal: (2, N) derivatives of the undistorted detections by the logarithm of the focal length.
@@ -65,6 +69,7 @@ class Window:
     since: Array
     states: States
     velocity_sigma: Array
+    moving: Mask
     single: Mask
     observations: MatchedObservations
     by_focal: Array
@@ -74,6 +79,11 @@ class Window:
     def camera(self) -> Index:
         """(N,) of each observation."""
         return self.observations.detections.camera
+
+    @property
+    def growth(self) -> Array:
+        """(8 C,) errors of the cameras by the logarithm of the rig's size."""
+        return errors_of_size(self.T)
 
     def covariance(self, scale: float) -> Array:
         """(8 C, 8 C) of the errors of the cameras, if those of the calibration are larger than it states."""
@@ -91,6 +101,7 @@ class Window:
             self,
             states=self.states.select(bodies),
             velocity_sigma=self.velocity_sigma[bodies],
+            moving=self.moving[bodies],
             single=self.single[bodies],
             observations=replace(seen, discs=discs),
             by_focal=np.ascontiguousarray(self.by_focal[:, kept]),
@@ -102,7 +113,8 @@ class Window:
 class Hypothesis:
     """The errors (C, 8) that are free, and where the search for them begins (C, 8); `cameras` are those at fault.
 
-    The standard deviations of all other errors are `scale` times those of the calibration.
+    The standard deviations of all other errors are `scale` times those of the calibration. Of the cause "wand" is an
+    error that all cameras have in common: the size of the rig.
     """
 
     cause: Cause | None
@@ -117,7 +129,7 @@ class Hypothesis:
     ) -> "Hypothesis":
         """Errors of one cause in some cameras; without a cause, none or all errors of these cameras."""
         free = np.zeros((n_cameras, ERRORS), bool)
-        free[list(cameras), CAUSES[cause] if cause else slice(0, ERRORS)] = True
+        free[list(cameras), CAUSES.get(cause, slice(0, ERRORS)) if cause else slice(0, ERRORS)] = True
         begin = np.zeros((n_cameras, ERRORS)) if start is None else np.where(free, start, 0.0)
         return cls(cause, tuple(cameras), free, begin)
 
@@ -128,7 +140,8 @@ class Hypothesis:
 
     def is_part_of(self, other: "Hypothesis") -> bool:
         """Whether the other one frees all that this one does."""
-        return bool((self.free <= other.free).all()) and self.scale in (1.0, other.scale)
+        is_of_wand = self.cause == "wand" != other.cause
+        return bool((self.free <= other.free).all()) and self.scale in (1.0, other.scale) and not is_of_wand
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,6 +197,10 @@ class Fit:
         """Mean squared residual in units of its expectation, not below 1."""
         known = self.squared[np.isfinite(self.squared)]
         return max(1.0, float(known.mean()) / 2) if len(known) else 1.0
+
+    def growth(self, window: Window) -> float:
+        """The logarithm of how much larger the arena is than the rig, by the errors."""
+        return float(self.errors.ravel() @ window.growth / (window.growth @ window.growth))
 
     def is_adequate(self) -> bool:
         """Whether the residuals are noise of any variance: a wrong model leaves more large ones."""
@@ -295,6 +312,7 @@ def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Seq
     if moved:
         return decide([*as_stated, fit(window, Hypothesis.of("pose", moved, n, starts))], seeing, moved)
     fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in seeing]
+    fits += [fit(window, Hypothesis.of("focal", seeing, n)), fit(window, Hypothesis.of("wand", (), n))]
     if len(seeing) > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
@@ -365,7 +383,8 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
         and (not best.hypothesis.odds or 2 * len(f.hypothesis.cameras) < len(seeing))
     ]
     cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
-    if not rivals and (2 * len(cameras) < len(seeing) or cameras == tuple(moved)):
+    is_of_few = cause == "focal" or 2 * len(cameras) < len(seeing)
+    if not rivals and (is_of_few or cameras == tuple(moved)):
         return Verdict(cause, cameras, best)
     named = {k for f in (best, *rivals) for k in f.hypothesis.cameras}
     return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best)
@@ -392,7 +411,8 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
         if is_converged:
             break
     reduced, _ = _eliminate(window, at, 0.0)
-    penalty = float(hypothesis.free.sum() * np.log(2 * len(at.squared)))
+    n_free = int(hypothesis.free.sum()) + (hypothesis.cause == "wand")
+    penalty = float(n_free * np.log(2 * len(at.squared)))
     if hypothesis.scale != 1.0:
         stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
         penalty += np.log(2 * len(at.squared)) + larger - stated
@@ -405,6 +425,8 @@ def _prior(window: Window, hypothesis: Hypothesis) -> Array:
     held = ~hypothesis.free.ravel()
     covariance = window.covariance(hypothesis.scale) * np.outer(held, held)
     covariance += np.diag((hypothesis.free * FREE_SIGMA**2).ravel())
+    if hypothesis.cause == "wand":
+        covariance += WAND_SIGMA**2 * np.outer(window.growth, window.growth)
     return np.asarray(np.linalg.inv(covariance), float)
 
 
@@ -425,7 +447,7 @@ class _Point:
         prior: (8 C, 8 C) information about the errors of the cameras.
         rows: (N, 2, 12 + 8 + 1) derivatives by body and camera, and residuals.
         squared: (N,) squared residuals; NaN where the disc is not visible.
-        cost: robust sum of squares, with the priors of what is not free.
+        cost: robust sum of squares, with the priors.
     """
 
     errors: Array
@@ -439,23 +461,26 @@ class _Point:
 def _evaluate(window: Window, hypothesis: Hypothesis, prior: Array, errors: Array, bodies: Array) -> _Point:
     """Linearize at a point; `prior` (8 C, 8 C) is the information of the hypothesis."""
     states, seen = window.states.retract(bodies), window.observations.detections
-    T, camera = retract(window.T, errors), seen.exposures.camera
+    T, camera, discs = retract(window.T, errors), seen.exposures.camera, window.observations.discs
     R, centres = T[camera, :3, :3].transpose(0, 2, 1), T[camera, :3, 3]
-    tau = seen.exposures.tau + errors[camera, 6]
-    exposures = _core.CameraExposures(
-        np.ascontiguousarray(R), np.ascontiguousarray(centres), tau, np.zeros(len(camera))
+    shows_clock, tau = window.moving[discs.body], seen.exposures.tau
+    exposures = _core.CameraExposures(  # with the errors of clocks, and then without these
+        np.tile(R, (2, 1, 1)),
+        np.tile(centres, (2, 1)),
+        np.concatenate([tau + errors[camera, 6], tau]),
+        np.zeros(2 * len(camera)),
     )
-    poses, discs = _core.FramePoses(states.bodies, exposures), window.observations.discs.columns
-    whiten = window.observations.whiten
-    by_body = poses.linearize_centres(discs, seen.xy, whiten, window.single)
-    by_camera = poses.differentiate_by_camera(discs, whiten, window.by_focal)
+    columns = replace(discs, frame=discs.frame + len(camera) * ~shows_clock).columns
+    poses, whiten = _core.FramePoses(states.bodies, exposures), window.observations.whiten
+    by_body = poses.linearize_centres(columns, seen.xy, whiten, window.single)
+    by_camera = poses.differentiate_by_camera(columns, whiten, window.by_focal)
+    by_camera[:, :, 6] *= shows_clock[:, None]
     visible = (by_camera != 0).any((1, 2))
     r = by_body[:, :, 12] - by_camera[:, :, 7] * errors[window.camera, 7, None]
     squared = np.where(visible, np.sum(r**2, 1), np.nan)
     capped = np.nan_to_num(squared, nan=BEHIND)
-    held = np.where(hypothesis.free, 0.0, errors).ravel()
     cost = _core.CAUCHY**2 * np.log1p(capped / _core.CAUCHY**2).sum()
-    cost += held @ prior @ held + np.sum(bodies**2 * _body_prior(window))
+    cost += errors.ravel() @ prior @ errors.ravel() + np.sum(bodies**2 * _body_prior(window))
     rows = np.concatenate([by_body[:, :, :12], by_camera, r[:, :, None]], 2)
     return _Point(errors, bodies, prior, rows, squared, float(cost))
 

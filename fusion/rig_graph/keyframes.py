@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
+from scipy.special import chdtri
 
 from calib.rig.camera import FOCAL_STABILITY, Camera, pixel_jacobians
 from calib.rig.camera_errors import ERRORS
@@ -29,7 +30,7 @@ from fusion.model.observations import (
     MatchedObservations,
 )
 from fusion.model.states import Snapshot, States
-from fusion.rig_graph.hypotheses import CAUSES, FREE_SIGMA, Window
+from fusion.rig_graph.hypotheses import CAUSES, FREE_SIGMA, RIVAL, Window
 
 INTERVAL_NS = 90_000_000  # between keyframes: a tenth of a second, at 30 frame sets a second too
 HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its robots
@@ -330,6 +331,7 @@ def _assemble(
     centre = np.array([[cameras[name].cx, cameras[name].cy] for name in cameras.names])
     by_focal = np.linalg.solve(seen.scale.transpose(2, 0, 1), (seen.uv - centre[seen.camera].T).T[:, :, None])
     states = keyframes[0].states.joined(*(keyframe.states for keyframe in keyframes[1:]))
+    sigma = velocity_sigma(keyframes, robots)
     single = np.bincount(markers.robot)[robots] == 1
     return Window(
         names=cameras.names,
@@ -337,7 +339,8 @@ def _assemble(
         prior=cameras.covariance,
         since=_since(cameras, exposures),
         states=states,
-        velocity_sigma=velocity_sigma(keyframes, robots),
+        velocity_sigma=sigma,
+        moving=is_significant(states.omega, sigma[:, 0]) | is_significant(states.v, sigma[:, 1]),
         single=single,
         observations=observations,
         by_focal=np.ascontiguousarray(by_focal[:, :, 0].T),
@@ -351,6 +354,11 @@ def velocity_sigma(keyframes: Sequence[Keyframe], robots: Index) -> Array:
     count = np.maximum(np.bincount(robots), 1)
     usual = np.stack([np.bincount(robots, of) / count for of in change.T], axis=1)[robots]
     return np.sqrt(noise + np.maximum(0.0, np.maximum(change, usual)))
+
+
+def is_significant(velocity: Array, sigma: Array) -> Mask:
+    """(B,) whether velocities (B, 3) are more than noise, with standard deviations (B,) of a coordinate."""
+    return np.sum(velocity**2, axis=1) > chdtri(3, RIVAL) * sigma**2
 
 
 def _are_determined(robot: Index, camera: Index) -> Mask:

@@ -27,10 +27,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from calib.rig.camera import Camera
-from calib.rig.camera_errors import ERRORS, with_errors
+from calib.rig.camera_errors import ERRORS, USUAL_PX, with_errors
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose
-from fusion.model.corrections import ExtrinsicsCorrection
+from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import Snapshot
@@ -48,7 +48,8 @@ from fusion.rig_graph.hypotheses import (
     judge,
     retract,
 )
-from fusion.rig_graph.keyframes import N_MEAN, Keyframe, Keyframes, Moments, window_of
+from fusion.rig_graph.keyframes import GATES_PX, N_MEAN, Keyframe, Keyframes, Moments, window_of
+from fusion.rig_graph.refinement import Refinement
 
 log = logging.getLogger("fusion")
 T = TypeVar("T")
@@ -88,6 +89,7 @@ class RigMonitor:
         excluded: names of moved cameras whose poses are not known yet.
         pinned: names of cameras whose poses a user confirmed; these do not change.
         contradicting: names of the cameras of which some are at fault, but the data do not decide which.
+        refines: whether poses and lenses are corrected by what robots show of them.
         is_settled: whether the last `check` judged what contradicts the predictions: no clock is searched for.
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
     """
@@ -103,17 +105,19 @@ class RigMonitor:
         self._departures: tuple[Departure, ...] = ()
         self._given_ns = self._measured_ns = 0  # of the last keyframes of the last job, and of the walk
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
+        self._refinement: Refinement | None = None  # of the cameras in use; None before their first window
         self._was_doubtful = False
         self._moments: deque[tuple[FrameSet, Snapshot]] = deque()
         self._moved: set[str] = set()  # the excluded cameras that showed most markers elsewhere
         self._given: tuple[dict[str, Camera], float, MarkerTable] = {}, 1.0, markers  # to the job
         self._is_confirmed = False  # whether the job confirms a judgement
+        self._is_of_wand = False  # whether what contradicts is the size of the rig
         self._size_m = 0.0  # of what contradicts, at the robots
         self._scale = (
             1.0  # of the rig's errors, accepted; claims may count them larger while nothing is decided
         )
         self._doubted: set[str] = set()  # cameras that contradicted each other when claims grew
-        self.is_settled = False
+        self.is_settled, self.refines = False, True
         self.executor: Executor | None = None
         self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
         self.excluded: set[str] = set()
@@ -125,12 +129,12 @@ class RigMonitor:
         self.inherit_poses(old)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
         self._moved = old._moved
-        self._scale, self._doubted = old._scale, old._doubted
-        self._cameras.scale_errors(old._cameras.error_scale)
+        self._scale, self._doubted, self._refinement = old._scale, old._doubted, old._refinement
+        self._cameras.count_errors(old._cameras.error_scale, old._cameras.size_error)
 
     def inherit_poses(self, old: "RigMonitor") -> None:
         """The poses that another monitor of the same cameras knows, and those that a user confirmed."""
-        self._known, self.pinned = old._known, old.pinned
+        self._known, self.pinned, self.refines = old._known, old.pinned, old.refines
 
     def remember(self, rigs: Iterable[Mapping[str, Camera]]) -> None:
         """Poses of cameras in earlier rigs, oldest first, to which these cameras may return."""
@@ -159,7 +163,7 @@ class RigMonitor:
             return ()
         return (
             Contradiction(
-                kind="undecided" if len(self.contradicting) > 1 else "camera",
+                kind="wand" if self._is_of_wand else "undecided" if len(self.contradicting) > 1 else "camera",
                 names=self.contradicting,
                 error_over_claim=self._cameras.error_scale**2,
                 size_mm=1e3 * self._size_m,
@@ -185,7 +189,7 @@ class RigMonitor:
         recalibrates: bool,
         is_doubtful: bool,
         displaced: Mapping[int, int],
-    ) -> tuple[ExtrinsicsCorrection, ...]:
+    ) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         """Judge the cameras if it is time; the cameras to exclude, and those to use with another pose.
 
         Args:
@@ -209,7 +213,9 @@ class RigMonitor:
             self._judge(now.t_ns)
         return self._act_on_judgements(now.t_ns, recalibrates)
 
-    def _act_on_judgements(self, now_ns: int, recalibrates: bool) -> tuple[ExtrinsicsCorrection, ...]:
+    def _act_on_judgements(
+        self, now_ns: int, recalibrates: bool
+    ) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         while self._job is not None and self._job.done():
             job, self._job = self._job, None
             if self._revision != self._cameras.revision:
@@ -259,7 +265,9 @@ class RigMonitor:
 
     def _act(
         self, window: Window, verdict: Verdict, measured: Measured | None, recalibrates: bool
-    ) -> tuple[ExtrinsicsCorrection, ...]:
+    ) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
+        if recalibrates and self.refines and (refined := self._refine(window, verdict, measured)):
+            return (refined,)
         names = self._blamed(window, verdict)
         self.is_settled = verdict.cause != "clock"
         self._note_clocks(verdict, measured)
@@ -274,6 +282,7 @@ class RigMonitor:
             self._scale_claims(window, verdict, names)
         if names:
             self._size_m = _claim_m(window) * verdict.misfit**0.5
+            self._is_of_wand = verdict.cause == "wand"
         self._note_undecided(names if self._n_undecided >= CONFIRMED else self._underrated())
         if not self._is_contradicted:
             return self._returned(window)
@@ -288,11 +297,37 @@ class RigMonitor:
         self._use(name)
         return (*changes, placed)
 
+    def _refine(self, window: Window, verdict: Verdict, measured: Measured | None) -> RigRefinement | None:
+        """Add a window that contradicts no pose to what is known of all errors; the rig with other poses and lenses if
+        they are larger than it states."""
+        is_explained = verdict.cause == "focal" or (verdict.cause is None and not verdict.cameras)
+        is_accepted = self._scale > 1.0 or not verdict.is_of_rig
+        if measured is None or self.excluded or not (is_explained and is_accepted):
+            return None
+        refinement = self._refinement or Refinement(self._cameras.as_dict(), window.since)
+        self._refinement = refinement
+        refinement.widen(self._scale)
+        if verdict.cause == "focal":
+            for k in verdict.cameras:
+                refinement.free_lens(k)
+        refinement.update(*measured)
+        if not refinement.is_significant:
+            return None
+        refined = refinement.correct(self.pinned)
+        for name in window.names:
+            self._remember(name, self._cameras[name])
+        self._use_all()
+        self._refinement = refinement
+        return refined
+
     def _blamed(self, window: Window, verdict: Verdict) -> tuple[str, ...]:
         """The cameras that are at fault, or contradict each other: of three that see robots no single one, unless it is
-        known why; all, by errors that are larger than stated, only if they are stated."""
+        known why; all, by errors that are larger than stated, only if they are stated; all, if the rig has another
+        size than the robots."""
         if verdict.cause is None and len(verdict.cameras) == 1 and len(_seeing(window)) <= MIN_FOR_PAIRS:
             return tuple(_seeing(window))
+        if verdict.cause == "wand":
+            return window.names
         if verdict.cause is None and verdict.fit.hypothesis.scale != 1.0 and not self._states_errors():
             return ()
         return tuple(window.names[k] for k in verdict.cameras)
@@ -305,15 +340,19 @@ class RigMonitor:
         self._scale, claimed = scales
         if self._scale == claimed:
             self._doubted.clear()
-        self._cameras.scale_errors(claimed)
+        size_error = (
+            abs(verdict.fit.growth(window)) if verdict.cause == "wand" else self._cameras.size_error * fall
+        )
+        self._cameras.count_errors(claimed, size_error)
 
     def _states_errors(self) -> bool:
         return any(c.errors or c.covariance for c in self._cameras.as_dict().values())
 
     def _underrated(self) -> tuple[str, ...]:
-        """The cameras, if their errors are larger than the rig states; a rig may state none."""
-        is_large = self._cameras.error_scale >= LARGE
-        return self._cameras.names if is_large and self._states_errors() else ()
+        """The cameras, if their errors are larger than the rig states, or, where it states none, so large that markers
+        may be mistaken."""
+        least = LARGE if self._states_errors() else GATES_PX[-1] / USUAL_PX
+        return self._cameras.names if self._cameras.error_scale >= least else ()
 
     def _returned(self, window: Window) -> tuple[ExtrinsicsCorrection, ...]:
         """The excluded cameras that agree with the others, as they were: nothing is at fault in the window."""
@@ -350,6 +389,12 @@ class RigMonitor:
                 "camera %s contradicts the other cameras: its lens changed, or it was moved; it is used as it is, "
                 "and poses claim less; calibrate it again",
                 *names,
+            )
+        elif names and not self.contradicting and self._is_of_wand:
+            log.warning(
+                "the rig is %.1f %% larger or smaller than the robots: the wand's lengths are wrong, or the markers of "
+                "all robots; poses claim less; measure them, and calibrate again",
+                100 * self._cameras.size_error,
             )
         elif names and not self.contradicting:
             log.warning(
@@ -409,11 +454,16 @@ class RigMonitor:
     def _use(self, name: str) -> None:
         self.excluded.discard(name)
         self._moved.discard(name)
+        self._use_all()
+
+    def _use_all(self) -> None:
+        """The poses of cameras are others: forget what was judged by the old ones."""
         self._forget()
         self._walk.forget_poses()
+        self._refinement = None
         self._is_contradicted, self._n_undecided = False, 0
         self._scale = 1.0
-        self._cameras.scale_errors(1.0)
+        self._cameras.count_errors(1.0, 0.0)
         self._doubted.clear()
         self._clocks.clear()
         self._moments.clear()

@@ -46,6 +46,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         audit: the file to which a line is appended for every change of rig and robots over the network.
         rate_hz: poses a second; without it the rate of the fastest camera.
         limits: see `Limits`.
+        refine: whether the server corrects poses and lenses of cameras by what robots in motion show of them.
         zones: of an arena with several servers; the first one has the clock, the rig and the robots for all.
         zone: the name of this server's zone.
     """
@@ -61,6 +62,7 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     audit: str | None = None
     rate_hz: float | None = None
     limits: LimitSettings = LimitSettings()
+    refine: bool = True
     zones: tuple[Zone, ...] = ()
     zone: str | None = None
 

@@ -14,7 +14,7 @@ from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import RoundelError
 from camera_node.protocol.requests import RequestSource
 from fusion.errors import FusionError
-from fusion.model.corrections import ExtrinsicsCorrection, corrected_camera, with_errors_of
+from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement, corrected_cameras, with_errors_of
 from fusion.model.frames import CalibratedFrame
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import Robots, RobotsRequest, robots_digest
@@ -57,6 +57,7 @@ class TrackingPipeline:
         self.early: AssociatedFrames | None = None  # of the open frame set
         self._is_wand_recorded = False
         self._judging: Executor | None = None
+        self._refines = config.refine
         self._start(self.cameras)
         self.active_rig.load(lambda rig: self._start(rig.placed()))
         if self.tracker is not None:
@@ -88,6 +89,7 @@ class TrackingPipeline:
         """
         self._use(rig, lambda: self.active_rig.save(rig, now_ns, source))
         self.active_rig.use(rig, now_ns, source)
+        self.refine(self._config.refine)
 
     def rename_camera(self, before: str, after: str, now_ns: int, source: RequestSource | None) -> None:
         """Give a camera another name in all versions of the rig; raises as `replace_rig`."""
@@ -100,15 +102,18 @@ class TrackingPipeline:
     def step_rig(self, step: Step, now_ns: int, source: RequestSource | None = None) -> None:
         """Restore the rig before the last change, or the one that was undone last.
 
-        A camera is no longer monitored once the server's recalibration of it is undone.
+        A camera is no longer monitored once the server's recalibration of it is undone, and the rig is no longer
+        refined once a refinement is.
 
         Raises:
             FusionError, ConfigError, CalibrationError: there is none, or it can't be used.
         """
         before, rig = self.active_rig.rig, self.active_rig.neighbour(step)
-        pinned = corrected_camera(before, rig) if before and step == "undo" else None
-        self._use(rig, lambda: self.active_rig.take(step), pinned)
+        corrected = corrected_cameras(before, rig) if before and step == "undo" else []
+        self._use(rig, lambda: self.active_rig.take(step), corrected[0] if len(corrected) == 1 else None)
         self.active_rig.use(rig, now_ns, source)
+        if len(corrected) > 1:
+            self.refine(False)
 
     def follow_rig(self, message: RigMessage) -> None:
         """Use the rig that the first zone's server published; raises FusionError if it can't be used."""
@@ -116,10 +121,12 @@ class TrackingPipeline:
             self._use(message.rig, lambda: None)
             self.active_rig.message = message
 
-    def correct_rig(self, correction: ExtrinsicsCorrection, now_ns: int) -> None:
-        """Update the active rig by a camera with another pose."""
-        if correction.camera is not None and correction.camera != self.cameras.get(correction.name):
+    def correct_rig(self, correction: ExtrinsicsCorrection | RigRefinement, now_ns: int) -> None:
+        """Update the active rig by cameras with other poses."""
+        old = self.cameras
+        if any(camera != old.get(name) for name, camera in correction.placed.items()):
             self.active_rig.correct(correction, now_ns)
+            self._recalibrate_frames(old, self.cameras)
 
     def _use(self, rig: Rig, save: Callable[[], object], pinned: str | None = None) -> None:
         """Track with another rig, then save it; on a fault of either, track with the old one again.
@@ -174,6 +181,7 @@ class TrackingPipeline:
         limits = self._config.limits
         self.tracker = Tracker(cameras, self.robots, limits, self._config.leads) if cameras else None
         self.judge_cameras_in(self._judging)
+        self.refine(self._refines)
         self.pause_acquisition(self._is_wand_recorded)
         self.synchronizer = FrameSynchronizer.at_rate(self._config.rate_hz, limits.lateness_ms)
         if cameras:
@@ -213,6 +221,12 @@ class TrackingPipeline:
         self._is_wand_recorded = is_wand_recorded
         if self.tracker is not None:
             self.tracker.acquires_none = is_wand_recorded
+
+    def refine(self, refines: bool) -> None:
+        """Correct the rig by what robots show of it, or not any more."""
+        self._refines = refines
+        if self.tracker is not None:
+            self.tracker.monitors.rig.refines = refines
 
     def judge_cameras_in(self, executor: Executor | None) -> None:
         """Judge the cameras beside the thread that tracks; in it with None, so that a run repeats exactly."""

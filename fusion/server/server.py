@@ -22,7 +22,7 @@ from camera_node.protocol.messages import Keys, MessageError, decode, encode
 from camera_node.protocol.session import listening_endpoints, read_config
 from camera_node.protocol.tcp_sockets import close_excess, stop_lingering
 from fusion.errors import FusionError
-from fusion.model.corrections import ExtrinsicsCorrection
+from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import FrameSet
 from fusion.model.undistortion import prepare_lenses
 from fusion.protocol.arena_health import describe_status
@@ -284,19 +284,21 @@ class Server:
         states: dict[str, TrackingState] = {pose.robot: pose.state for pose in result.poses}
         self.statistics.count_frame_set(result.cameras, states, latency.total_ms if latency else None)
 
-    def _report_correction(self, correction: ExtrinsicsCorrection) -> None:
-        """Log a moved camera; publish the rig once the camera is recalibrated, by the server that has the rig."""
-        if correction.camera is None:
+    def _report_correction(self, correction: ExtrinsicsCorrection | RigRefinement) -> None:
+        """Log a change of the cameras; publish the rig if they have other poses, by the server that has the rig."""
+        undo = "roundel undo reverts that"
+        if correction.placed:
+            self.pipeline.correct_rig(correction, self.clock.now_ns())
+            if self.pipeline.active_rig.message is not None:
+                self.transport.publish(self.keys.rig, self.pipeline.active_rig.message)
+        if isinstance(correction, RigRefinement):
+            log.warning("%s; %s", correction, undo)
+        elif correction.camera is None:
             self.statistics.note_moved(correction.name)
-            return
-        self.pipeline.correct_rig(correction, self.clock.now_ns())
-        if self.pipeline.active_rig.message is not None:
-            self.transport.publish(self.keys.rig, self.pipeline.active_rig.message)
-        if correction.has_returned:
-            change = "camera %s is at a known pose, and used again"
         else:
-            change = "camera %s is recalibrated and used again; roundel undo reverts that"
-        log.warning(change, correction.name, extra=about(correction.name))
+            change = f"recalibrated and used again; {undo}"
+            change = "at a known pose, and used again" if correction.has_returned else change
+            log.warning("camera %s is %s", correction.name, change, extra=about(correction.name))
 
     def _report_status(self, now_ns: int) -> FusionStatus | None:
         """Publish the status once a second; return it if it was due."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Index, Mask
-from fusion.model.corrections import ExtrinsicsCorrection
+from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MatchedObservations
@@ -177,7 +177,7 @@ class Tracker:
         unlabeled = self._track_unlabeled(update, found.markers)
         return self._report(update, unlabeled, found.crowded)
 
-    def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection, ...]:
+    def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
         now = Snapshot(frame_set.t_ns, self.table.states, self.table.located)
         is_doubtful, displaced = self.robust.is_doubtful, self.own.displaced

@@ -32,7 +32,7 @@ from calib.rig.rig_messages import (
 from camera_node.foundation.config import write_atomically
 from camera_node.foundation.errors import ConfigError, RoundelError
 from camera_node.protocol.requests import RequestSource
-from fusion.model.corrections import ExtrinsicsCorrection, correct, is_corrected
+from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement, correct, is_corrected
 
 log = logging.getLogger("fusion")
 State = Literal["earlier", "in force", "undone"]
@@ -143,8 +143,8 @@ class ActiveRig:
         files = [*self._history.older()[-1:], *self._history.undone()[-1:], self._history.path]
         return self.rig is None or any(holds_rig(path, self.rig) for path in files)
 
-    def correct(self, correction: ExtrinsicsCorrection, now_ns: int) -> None:
-        """Use a new pose of a camera that was moved. A fault of the disk is only logged."""
+    def correct(self, correction: ExtrinsicsCorrection | RigRefinement, now_ns: int) -> None:
+        """Use other poses of cameras. A fault of the disk is only logged."""
         assert self.rig is not None
         rig = correct(self.rig, correction, now_ns)
         saved = None

@@ -115,7 +115,7 @@ class SceneCamera(Source):
         T[:3, :3], T[:3, 3] = rotation_from_vector(np.array(fault.turn_rad)), fault.shift_m
         moved, scale = Pose.from_matrix(camera.matrix() @ T), fault.focal_scale
         true = msgspec.structs.replace(camera, T_world_cam=moved, fx=camera.fx * scale, fy=camera.fy * scale)
-        self._scene.cameras.place(self._name, true)
+        self._scene.cameras.place({self._name: true})
         self.fault = fault
 
     @property

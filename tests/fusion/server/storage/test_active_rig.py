@@ -25,7 +25,7 @@ from camera_node.protocol.server_connection import Connection
 from camera_node.protocol.session import open_router
 from fusion.client.arena import Arena as Client
 from fusion.commands.history import history
-from fusion.model.corrections import ExtrinsicsCorrection
+from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement, corrected_cameras
 from fusion.protocol.pose_messages import Robots, robots_key
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.storage.active_rig import ActiveRig
@@ -158,6 +158,41 @@ def test_undo_of_a_correction_restores_the_camera_and_no_longer_monitors_it(tmp_
         assert re.fullmatch(r"redone on the server: cam1 .* mm \(.*\); changed cameras: cam1\n", done.stdout)
         done = run_program("fusion", "redo", *where)
         assert (done.returncode, "no undone version" in done.stderr) == (2, True)
+
+
+def test_undo_of_a_refinement_restores_the_rig_and_no_longer_refines_it(tmp_path: Path):
+    """Moved cameras are found as before; a new calibration may be refined again."""
+    with serving(saving(tmp_path)) as (server, client):
+        cameras = dict(ARENA.cameras) | {"cam1": MOVED}
+        refinement = RigRefinement(cameras, dict.fromkeys(cameras, 0.2), (0.0,) * 8)
+        server.transport.enqueue(lambda: server.pipeline.correct_rig(refinement, 1))
+        wait_for(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == MOVED)
+        where = ("--connect", server.endpoints[0], "--arena", "test")
+        done = run_program("fusion", "undo", *where)
+        assert "the rig is not refined any more" in done.stdout
+        restored, tracker = client.rig(DEADLINE_S), server.pipeline.tracker
+        assert restored is not None
+        assert restored.cameras["cam1"] == ARENA.cameras["cam1"]
+        assert tracker is not None
+        assert not tracker.monitors.rig.refines
+        assert tracker.monitors.rig.pinned == set()
+        client.set_rig(Rig(cameras=cameras))
+        tracker = server.pipeline.tracker
+        assert tracker is not None
+        assert tracker.monitors.rig.refines
+
+
+@pytest.mark.parametrize(
+    ("entry", "names"),
+    [({"camera": "cam1", "t_ns": 5}, ["cam1"]), ({"cameras": ["cam1", 3]}, ["cam1"]), ("cam1", []), ({}, [])],
+)
+def test_the_entry_of_corrected_cameras_is_read_as_older_servers_wrote_it_or_anything(
+    entry, names: list[str]
+):
+    before = Rig(cameras=ARENA.cameras)
+    assert (
+        corrected_cameras(msgspec.structs.replace(before, calibration={"corrected": entry}), before) == names
+    )
 
 
 @pytest.mark.parametrize("with_rig", [True, False], ids=["configured", "saved"])

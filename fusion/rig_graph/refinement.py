@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Continuous calibration: how far the poses and lenses of cameras are from those in use (a Kalman filter).
+
+Every robot is a wand: each window of keyframes that contradicts no camera shows the errors of all of them. They wander
+about the calibration, by as much as it states and as a lens is stable. A window that contradicts what is known shows
+that one camera changed, if that explains it better than a change of any other.
+docs/design/rig_graph.md has the equations.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+
+import msgspec
+import numpy as np
+from scipy.special import chdtri
+
+from calib.rig.camera import Camera
+from calib.rig.camera_errors import (
+    ERRORS,
+    OF_IMAGE,
+    USUAL_PX,
+    error_covariance,
+    image_metrics,
+    own_blocks,
+    usual_covariance,
+    with_errors,
+    working_ranges,
+)
+from camera_node.foundation.arrays import Array, Index
+from camera_node.geometry.pose import Pose
+from fusion.model.corrections import RigRefinement
+from fusion.rig_graph.clock_walk import OFFSET_SIGMA_S
+from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, MIN_FOR_PAIRS, RIVAL, retract
+from fusion.rig_graph.keyframes import GATES_PX
+
+MEMORY_S = 60.0  # in which errors wander as far as the calibration states
+LARGE = 2.0  # ratio of errors in the image, those that are corrected over those that are stated
+CONFIRMED = 3  # windows in a row that contradict what is known, before that is forgotten
+
+
+class Refinement:
+    """The errors of C cameras as they are in use.
+
+    Args:
+        cameras: by name.
+        since: (8 C,) variances of what clocks and lenses change after the calibration.
+
+    Attributes:
+        cameras: as they are in use.
+        x, P: (8 C,) estimate and (8 C, 8 C) covariance of the errors.
+    """
+
+    def __init__(self, cameras: Mapping[str, Camera], since: Array) -> None:
+        self.cameras, given = cameras, list(cameras.values())
+        self._metrics = image_metrics(given)
+        self._stated, self._since, self._scale = error_covariance(given), np.diag(since), 1.0
+        self._own = _own_covariance(given, self._metrics)
+        self.x, self.P = np.zeros(len(since)), self._prior
+        self._t_ns = self._n_refused = 0
+        self._freed = set[int]()  # cameras that changed, and are not corrected yet
+
+    @property
+    def _prior(self) -> Array:
+        return self._scale**2 * self._stated + self._since
+
+    def widen(self, scale: float) -> None:
+        """The errors are larger than the rig states by a factor."""
+        if scale > self._scale:
+            self.P = self.P + (scale**2 - self._scale**2) * self._stated
+            self._scale = scale
+
+    def free_lens(self, k: int) -> None:
+        """The focal length of a camera is another one."""
+        row = ERRORS * k + CAUSES["focal"].start
+        self.P = self.P.copy()
+        self.P[row, row] += FREE_SIGMA[CAUSES["focal"]][0] ** 2
+
+    def _free(self, k: int) -> None:
+        """The pose or the lens of a camera is another one."""
+        rows = ERRORS * k + np.flatnonzero(OF_IMAGE)
+        self.P = self.P.copy()
+        self.P[np.ix_(rows, rows)] += (GATES_PX[-1] / USUAL_PX) ** 2 * self._own[np.ix_(rows, rows)]
+        self._freed.add(k)
+
+    def update(self, t_ns: int, H: Array, y: Array) -> None:
+        """Add keyframes: least squares H e = y, (8 C, 8 C) and (8 C,), about the errors at their mean time."""
+        self._wander(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
+        self._t_ns, identity = t_ns, np.eye(len(y))
+        with_own = np.linalg.inv(identity + H @ self._own)
+        H, y = with_own @ H, with_own @ y
+        if not self._agrees(H, y - H @ self.x):
+            self._n_refused += 1
+            if self._n_refused >= CONFIRMED:
+                self.x, self.P, self._n_refused = np.zeros_like(self.x), self._prior, 0
+                self._freed.clear()
+            return
+        off, self._n_refused = y - H @ self.x, 0
+        P = np.linalg.solve(identity + self.P @ H, self.P)
+        self.P = (P + P.T) / 2
+        self.x = self.x + self.P @ off
+
+    def _wander(self, dt: float) -> None:
+        """An Ornstein-Uhlenbeck process about the rig in use."""
+        kept = np.exp(-dt / MEMORY_S)
+        self.x, self.P = kept * self.x, kept**2 * self.P + (1 - kept**2) * self._prior
+
+    def _agrees(self, H: Array, off: Array) -> bool:
+        """Whether a window agrees with what is known, or shows which camera changed: its pose and its lens are free
+        from then on, since one place of the robots does not tell them apart.
+
+        Of three cameras, two that moved together look like the third; a clock is that of `ClockWalk`.
+
+        Args:
+            H: (8 C, 8 C) information of the window about the errors.
+            off: (8 C,) H times the difference between the errors that it shows and the estimate.
+        """
+        n = len(off) // ERRORS
+        with_window = np.eye(len(off)) + H @ self.P
+        information = np.asarray(np.linalg.solve(with_window, H), float)
+        score = np.asarray(np.linalg.solve(with_window, off), float)
+        gains = {
+            (k, cause): _gain(score, information, ERRORS * k + np.arange(ERRORS)[rows], FREE_SIGMA[rows])
+            for k in range(n)
+            for cause, rows in CAUSES.items()
+        }
+        (camera, cause), gain = max(gains.items(), key=lambda item: item[1])
+        if gain < chdtri(2, FALSE_ALARM):
+            cost = off @ np.linalg.solve(H + np.diag(np.tile(FREE_SIGMA**-2, n)), score)
+            return bool(cost < chdtri(len(off), FALSE_ALARM))
+        rival = max(g for (k, other), g in gains.items() if k != camera or "clock" in (cause, other))
+        n_seeing = np.count_nonzero(np.diag(H)[::ERRORS])
+        if n_seeing <= MIN_FOR_PAIRS or gain - rival < chdtri(2, RIVAL):
+            return False
+        self._free(camera)
+        return True
+
+    @property
+    def off_px(self) -> Array:
+        """(C,) what the estimated errors displace in the images, RMS of a coordinate."""
+        return self._image_px(np.outer(self.x, self.x))
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether a camera is off by more than the rig states, and none so far that its markers were mistaken; of a
+        camera that changed, by more than is uncertain yet."""
+        off_px, least = self.off_px, LARGE * np.maximum(self._image_px(self._stated), USUAL_PX)
+        freed = sorted(self._freed)
+        is_known = (off_px > LARGE * self._image_px(self.P))[freed].all()
+        return bool((off_px > least).any() and (off_px < GATES_PX[-1]).all() and is_known)
+
+    def _image_px(self, covariance: Array) -> Array:
+        return np.sqrt(np.einsum("kij,kij->k", own_blocks(covariance), self._metrics))
+
+    def correct(self, kept: Collection[str]) -> RigRefinement:
+        """Correct all cameras but some by their estimated errors, which count from the corrected poses on. A lens is as
+        it was where that is negligible."""
+        off_px, errors = self.off_px, self.x.reshape(-1, ERRORS).copy()
+        errors[[name in kept for name in self.cameras]] = 0.0
+        errors[:, 6] = 0.0
+        focal_px = np.sqrt(self._metrics[:, 7, 7]) * np.abs(errors[:, 7])
+        errors[focal_px < USUAL_PX, 7] = 0.0
+        self.x = self.x - errors.ravel()
+        joint = self.P + self._own + np.outer(self.x, self.x)
+        clocks = np.arange(6, len(self.x), ERRORS)
+        joint[clocks], joint[:, clocks] = self._stated[clocks], self._stated[:, clocks]
+        self._stated, self._scale = joint, 1.0
+        self._freed.clear()
+        pairs = zip(self.cameras.items(), errors, strict=True)
+        self.cameras = with_errors({name: _displaced(camera, e) for (name, camera), e in pairs}, joint)
+        worst = errors[np.argmax(off_px)].tolist()
+        return RigRefinement(
+            self.cameras, dict(zip(self.cameras, off_px.tolist(), strict=True)), tuple(worst)
+        )
+
+
+def _displaced(camera: Camera, errors: Array) -> Camera:
+    """The camera with another pose and focal length, by its errors (8,)."""
+    if not errors.any():
+        return camera
+    T, scale = retract(camera.matrix()[None], errors[None])[0], float(np.exp(errors[7]))
+    fx, fy = (camera.fx * scale, camera.fy * scale) if errors[7] else (camera.fx, camera.fy)
+    return msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T), fx=fx, fy=fy, covariance=None)
+
+
+def _gain(score: Array, information: Array, rows: Index, sigma: Array) -> float:
+    """Twice the logarithm by which free errors make a window more likely.
+
+    Args:
+        score: (8 C,) derivative of the logarithm of the likelihood by the errors.
+        information: (8 C, 8 C) of the window and of the estimate about a change of the errors.
+        rows, sigma: (n,) of the free errors, and their standard deviations.
+    """
+    A, b = np.eye(len(rows)) + sigma[:, None] * information[np.ix_(rows, rows)] * sigma, sigma * score[rows]
+    return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
+
+
+def _own_covariance(cameras: Sequence[Camera], metrics: Array) -> Array:
+    """(8 C, 8 C) of the errors that each window has of its own, because those of lenses and of robots' shapes vary with
+    the places of robots: `USUAL_PX` in the image by the pose, as much by the focal length, and those of the clocks."""
+    joint = np.zeros((len(cameras), ERRORS, len(cameras), ERRORS))
+    for k, (camera, range_m) in enumerate(zip(cameras, working_ranges(cameras).tolist(), strict=True)):
+        joint[k, :6, k, :6] = usual_covariance(camera, range_m)
+        joint[k, 6, k, 6] = OFFSET_SIGMA_S**2
+        joint[k, 7, k, 7] = USUAL_PX**2 / metrics[k, 7, 7]
+    return joint.reshape((len(cameras) * ERRORS,) * 2)

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What windows of keyframes show of the rig: estimates within their claims, and corrections of real errors."""
+
+from collections.abc import Mapping
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from calib.rig.camera import FOCAL_STABILITY, Camera
+from calib.rig.camera_errors import ERRORS, error_covariance, image_metrics
+from camera_node.geometry.pose import Pose
+from fusion.rig_graph.clock_walk import OFFSET_SIGMA_S
+from fusion.rig_graph.hypotheses import retract
+from fusion.rig_graph.refinement import Refinement
+from tests.fusion.synthetic import ring
+
+WINDOW_NS, START_NS = 600_000_000, 10**18
+NOISE_PX = 0.02  # of what a window shows of one error
+SINCE = np.array([1e-8] * 3 + [1e-8] * 3 + [OFFSET_SIGMA_S, FOCAL_STABILITY]) ** 2
+
+
+class Windows:
+    """Windows in which each camera shows all of its errors, relative to those of the others.
+
+    Args:
+        cameras: by name.
+        rng: for the noise.
+    """
+
+    def __init__(self, cameras: Mapping[str, Camera], rng: np.random.Generator) -> None:
+        self._rng, n = rng, len(cameras)
+        metrics = image_metrics(list(cameras.values()))
+        metrics[:, 6, 6] = 1e4**2  # a clock of 0.1 ms displaces an image by a pixel
+        information = np.zeros((n, ERRORS, n, ERRORS))
+        for k, metric in enumerate(metrics):
+            information[k, :, k] = metric / NOISE_PX**2
+        self._H = information.reshape(n * ERRORS, -1)
+        self._root = np.linalg.cholesky(self._H + 1e-9 * np.diag(np.diag(self._H)))
+
+    def show(self, refinement: Refinement, errors: np.ndarray, k: int) -> None:
+        """Window k, of errors (8 C,)."""
+        noise = self._root @ self._rng.normal(size=len(errors))
+        refinement.update(START_NS + k * WINDOW_NS, self._H, self._H @ errors + noise)
+
+
+def since(n: int) -> np.ndarray:
+    return np.tile(SINCE, n)
+
+
+def applied(before: Mapping[str, Camera], after: Mapping[str, Camera]) -> np.ndarray:
+    """(8 C,) the errors by which cameras were corrected."""
+    found = []
+    for name, camera in before.items():
+        motion = np.linalg.inv(camera.matrix()) @ after[name].matrix()
+        turn = (
+            np.array([motion[2, 1] - motion[1, 2], motion[0, 2] - motion[2, 0], motion[1, 0] - motion[0, 1]])
+            / 2
+        )
+        found.append([*turn, *motion[:3, 3], 0.0, np.log(after[name].fx / camera.fx)])
+    return np.ravel(found)
+
+
+def test_estimates_are_within_their_claims():
+    """Of errors that have the covariance of the calibration. Windows have less noise than they may."""
+    cameras, squares, n = ring(3), [], 3 * ERRORS
+    rng = np.random.default_rng(1)
+    prior = error_covariance(list(cameras.values())) + np.diag(since(3))
+    for _ in range(30):
+        truth = np.linalg.cholesky(prior) @ rng.normal(size=n)
+        refinement, windows = Refinement(cameras, since(3)), Windows(cameras, rng)
+        for k in range(8):
+            windows.show(refinement, truth, k)
+        off = refinement.x - truth
+        squares.append(off @ np.linalg.solve(refinement.P, off))
+    assert np.sum(squares) < chi2.ppf(0.999, 30 * n)
+
+
+@pytest.mark.parametrize("n", [2, 3, 8])
+def test_a_rig_without_errors_is_left_alone(n: int):
+    cameras = ring(n)
+    for seed in range(5):
+        refinement, windows = Refinement(cameras, since(n)), Windows(cameras, np.random.default_rng(seed))
+        for k in range(40):
+            windows.show(refinement, np.zeros(n * ERRORS), k)
+            assert not refinement.is_significant
+
+
+@pytest.mark.parametrize("percent", [0.2, -0.7])
+def test_a_lens_that_changes_is_corrected(percent: float):
+    """Within twelve windows, and no other camera by more than its noise: pose and lens look alike in these."""
+    cameras, lens = ring(4), 1 + percent / 100
+    changed = msgspec.structs.replace(
+        cameras["cam2"], fx=cameras["cam2"].fx * lens, fy=cameras["cam2"].fy * lens
+    )
+    refinement, windows = Refinement(cameras, since(4)), Windows(cameras, np.random.default_rng(2))
+    refined, metrics = [], image_metrics(list(cameras.values()))
+    for k in range(22):
+        truth = cameras if k < 10 else {**cameras, "cam2": changed}
+        windows.show(refinement, applied(refinement.cameras, truth), k)
+        if refinement.is_significant:
+            refined.append(refinement.correct(()))
+            assert not refinement.is_significant
+    left = applied(refinement.cameras, {**cameras, "cam2": changed}).reshape(-1, ERRORS)
+    assert np.sqrt(np.einsum("ki,kij,kj->k", left, metrics, left)).max() < 0.1  # of 0.6 px
+    assert refined
+    assert all("camera cam2 by" in str(found) for found in refined)
+
+
+def test_poses_that_drift_are_followed():
+    """All cameras turn by half a degree in an hour. Each correction states what is left, and the next go on from it."""
+    cameras, rng = ring(4), np.random.default_rng(3)
+    axes = rng.normal(size=(4, 3))
+    axes *= np.radians(0.5) / 3600 / np.linalg.norm(axes, axis=1, keepdims=True)
+    refinement, windows, n_corrections = Refinement(cameras, since(4)), Windows(cameras, rng), 0
+    off_px = []
+    for k in range(1500):
+        turned = np.zeros((4, ERRORS))
+        turned[:, :3] = axes * k * WINDOW_NS * 1e-9
+        truth = retract(np.array([c.matrix() for c in cameras.values()]), turned)
+        used = {
+            name: msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
+            for (name, camera), T in zip(cameras.items(), truth, strict=True)
+        }
+        errors = applied(refinement.cameras, used)
+        windows.show(refinement, errors, k)
+        if refinement.is_significant:
+            refinement.correct(())
+            n_corrections += 1
+        left = errors.reshape(-1, ERRORS)
+        off_px.append(
+            np.sqrt(np.einsum("ki,kij,kj->k", left, image_metrics(list(cameras.values())), left)).max()
+        )
+    assert n_corrections > 3
+    assert max(off_px) < 0.25  # of 1.4 px
+
+
+def test_a_clock_or_one_of_three_cameras_changes_no_pose():
+    for n, error in ((4, (6, 4e-3)), (3, (0, 1e-3))):
+        cameras, truth = ring(n), np.zeros(n * ERRORS)
+        refinement, windows = Refinement(cameras, since(n)), Windows(cameras, np.random.default_rng(4))
+        for k in range(6):
+            windows.show(refinement, truth, k)
+        truth[error[0]] = error[1]
+        windows.show(refinement, truth, 6)
+        windows.show(refinement, truth, 7)
+        assert not refinement.is_significant
+
+
+def test_what_is_kept_is_not_corrected_and_stays_known():
+    cameras, truth = ring(4), np.zeros(4 * ERRORS)
+    truth[0], truth[ERRORS + 1] = 3e-4, -3e-4
+    refinement, windows = Refinement(cameras, since(4)), Windows(cameras, np.random.default_rng(5))
+    refinement.widen(8.0)
+    for k in range(6):
+        windows.show(refinement, truth, k)
+    assert refinement.is_significant
+    refined = refinement.correct({"cam0"})
+    assert refined.rig["cam0"].T_world_cam == cameras["cam0"].T_world_cam
+    assert refinement.x[0] == pytest.approx(3e-4, rel=0.3)  # a turn looks like a shift
+    assert refinement.x[ERRORS + 1] == pytest.approx(0.0, abs=1e-12)
+    stated = error_covariance(list(refined.rig.values()))
+    assert stated[0, 0] > (2e-4) ** 2  # what is known of it and not corrected is claimed
