@@ -12,7 +12,7 @@ from calib.rig.camera_errors import ERRORS, as_pose_errors, with_errors
 from calib.rig.rig import Rig
 from calib.wand.alignment import Alignment, ClockMap
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance, parameter_sigma
-from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations, gauge_directions
+from calib.wand.bundle_adjustment.problem import Adjusted, WandObservations, gauge_directions
 from calib.wand.bundle_adjustment.residuals import point_residuals
 from calib.wand.detections import WandRecording
 from calib.wand.quality.checks import measure_lengths
@@ -32,6 +32,7 @@ from calib.world.world_frame import move_rig, upright_frame
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose, invert
 
+CLOCK_UNITS = np.array([1e3, 1e6, 1e3])  # ms of an offset, ppm of a drift, ms of a readout time
 MAX_POINTS = 500  # of the wand's path, for what its images do not tell apart
 
 
@@ -82,9 +83,9 @@ def conclude(rig: Rig, solution: Solution, placement: Placement, jump: ClockJump
     if placement.scaled_by is not None:
         adjusted = add_scale_uncertainty(adjusted, placement.scaled_by)
     covariance = camera_covariance(adjusted)
-    offsets, offset_sigma = clock_values(adjusted.state, covariance, OFFSET, 1e3)
-    drift, drift_sigma = clock_values(adjusted.state, covariance, DRIFT, 1e6)
-    readout, readout_sigma = clock_values(adjusted.state, covariance, READOUT, 1e3)
+    offsets, drift, readout = (adjusted.state.clocks * CLOCK_UNITS).T
+    variances = np.einsum("cpcp->cp", covariance.of((*OFFSET, *DRIFT, *READOUT)))
+    offset_sigma, drift_sigma, readout_sigma = (np.sqrt(variances) * CLOCK_UNITS).T
     offsets, drift = offsets - np.median(offsets), drift - drift.mean()
     size = 6 * len(placement.recording.names)
     return WandCalibration(
@@ -134,15 +135,6 @@ def with_aligned_clocks(result: WandCalibration, alignment: Alignment, start_s: 
         time_offset_ms=offset_ms,
         drift_ppm=1e6 * np.array(rate),
     )
-
-
-def clock_values(
-    state: State, covariance: CameraCovariance, part: tuple[int, ...], unit: float
-) -> tuple[Array, Array]:
-    """Return values and standard deviations (C,) of a clock parameter, OFFSET, DRIFT or READOUT, times `unit`."""
-    values = state.clocks[:, part[0] - OFFSET[0]]
-    sigma = np.sqrt(np.einsum("cpcp->c", covariance.of(part)))
-    return values * unit, sigma * unit
 
 
 def adjusted_camera(

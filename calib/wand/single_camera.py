@@ -20,7 +20,7 @@ from calib.wand.bundle_adjustment.problem import Adjusted, Estimate, WandObserva
 from calib.wand.bundle_adjustment.problem_setup import build_problem
 from calib.wand.calibrate import check_agreement
 from calib.wand.clock_model import with_readout_times
-from calib.wand.conclusion import Solution, adjusted_camera, clock_values
+from calib.wand.conclusion import Solution, adjusted_camera
 from calib.wand.detections import WandRecording
 from calib.wand.initial_rig import TwoViewGeometry
 from calib.wand.labels import label_recording
@@ -147,8 +147,8 @@ def _conclude(rig: Rig, name: str, this: int, solution: Solution) -> Recalibrati
     adjusted, observations, before = solution.adjusted, solution.observations, rig.cameras[name]
     covariance, T = camera_covariance(adjusted), adjusted.state.cameras[this]
     cov = covariance.of(POSE)[this, :, this]
-    offset_ms, sigma_ms = (column[this] for column in clock_values(adjusted.state, covariance, OFFSET, 1e3))
-    camera = adjusted_camera(before, adjusted, covariance, this, float(offset_ms))
+    offset_ms = 1e3 * float(adjusted.state.clocks[this, 0])
+    camera = adjusted_camera(before, adjusted, covariance, this, offset_ms)
     used = adjusted.used & (observations.camera == this)
     change = None if before.T_world_cam is None else invert(before.matrix()) @ T
     turn = None if change is None else vector_from_rotation(change[:3, :3])
@@ -159,7 +159,7 @@ def _conclude(rig: Rig, name: str, this: int, solution: Solution) -> Recalibrati
         turned_deg=None if turn is None else float(np.degrees(np.linalg.norm(turn))),
         residual_px=float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())),
         sigma_mm=float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
-        time_sigma_ms=float(sigma_ms),
+        time_sigma_ms=1e3 * float(np.sqrt(covariance.of(OFFSET)[this, 0, this, 0])),
         adjusted=adjusted,
         observations=observations,
     )
