@@ -87,14 +87,16 @@ class CameraCovariance:
 def camera_covariance(adjusted: Adjusted) -> CameraCovariance:
     """Compute the covariance of an adjustment's cameras."""
     problem, inverse, root = adjusted.problem, inverse_information(adjusted), _prior_root(adjusted)
+    shape, rows = (len(problem.lenses), len(problem.free)), problem.estimated_rows()
+    size = shape[0] * shape[1]
     by_root = inverse * root
-    noise = adjusted.scale**2 * adjusted.inflation * (inverse - by_root @ by_root.T)
-    given = problem.prior_sigma(of_covariance=True)[list(problem.estimated_cameras())].ravel()
-    by_prior = _all_cameras(adjusted, inverse * (root**2 * np.where(root > 0, given, 0.0)), 1)
-    noise = _all_cameras(adjusted, noise, 2)
-    return CameraCovariance(
-        problem.free, noise, by_prior, noise + np.einsum("cpm,eqm->cpeq", by_prior, by_prior)
-    )
+    given = problem.prior_sigma(of_covariance=True).ravel()[rows]
+    noise, by_prior = np.zeros((size, size)), np.zeros((size, len(rows)))
+    noise[np.ix_(rows, rows)] = adjusted.scale**2 * adjusted.inflation * (inverse - by_root @ by_root.T)
+    by_prior[rows] = inverse * (root**2 * np.where(root > 0, given, 0.0))
+    noise, by_prior = noise.reshape(*shape, *shape), by_prior.reshape(*shape, -1)
+    joint = noise + np.einsum("cpm,eqm->cpeq", by_prior, by_prior)
+    return CameraCovariance(problem.free, noise, by_prior, joint)
 
 
 def inverse_information(adjusted: Adjusted) -> Array:
@@ -104,17 +106,7 @@ def inverse_information(adjusted: Adjusted) -> Array:
 
 def _prior_root(adjusted: Adjusted) -> Array:
     """(S d,) square root of the priors' information."""
-    return 1 / adjusted.problem.prior_sigma()[list(adjusted.problem.estimated_cameras())].ravel()
-
-
-def _all_cameras(adjusted: Adjusted, part: Array, axes: int) -> Array:
-    """The rows (and columns, with two `axes`) of the estimated cameras among those of all; zero for the others."""
-    problem = adjusted.problem
-    count, d, estimated = len(problem.lenses), len(problem.free), list(problem.estimated_cameras())
-    full = np.zeros((count, d, count, d)[: 2 * axes] + part.shape[axes:])
-    split = part.reshape((len(estimated), d, len(estimated), d)[: 2 * axes] + part.shape[axes:])
-    full[np.ix_(*[estimated, range(d)] * axes)] = split
-    return full
+    return 1 / adjusted.problem.prior_sigma().ravel()[adjusted.problem.estimated_rows()]
 
 
 def inflation_factor(adjusted: Adjusted) -> float:

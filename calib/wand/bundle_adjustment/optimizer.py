@@ -342,9 +342,9 @@ def _solve_cameras(system: LinearSystem, information: Array, gradient: Array) ->
 
     free, estimated = list(system.problem.free), list(system.problem.estimated_cameras())
     d, graph, ordering = len(free), gtsam.GaussianFactorGraph(), gtsam.Ordering()
-    by_priors, prior_gradient = _prior_equations(system)
-    H = (information + by_priors).reshape(len(estimated), d, len(estimated), d)
-    g = (gradient + prior_gradient).reshape(-1, d)
+    rows, (by_priors, prior_gradient) = system.problem.estimated_rows(), system.priors
+    H = (information + by_priors[np.ix_(rows, rows)]).reshape(len(estimated), d, len(estimated), d)
+    g = (gradient + prior_gradient[rows]).reshape(-1, d)
     zero, none = np.zeros((d, d)), np.zeros(d)
     for k in range(len(estimated)):
         ordering.push_back(k)
@@ -392,11 +392,11 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     scores = sums.scores.copy()
     scores[: len(pulled)] -= (pulled[:, None, :h] @ G[:-1] + pulled[:, None, h:] @ G[1:])[:, 0]
     information = sums.of_cameras - G.reshape(-1, size).T @ along - by_prior.reshape(-1, size).T @ twice
-    by_priors, gradient = _prior_equations(system)
+    rows, (by_priors, gradient) = system.problem.estimated_rows(), system.priors
     return ProfiledMotion(
-        information=information + by_priors,
+        information=information + by_priors[np.ix_(rows, rows)],
         scores=scores,
-        gradient=scores.sum(axis=0) + gradient,
+        gradient=scores.sum(axis=0) + gradient[rows],
         sums=sums,
     )
 
@@ -555,13 +555,6 @@ def _sum_camera_hessians(system: LinearSystem, local: int) -> Array:
         J = system.rows[of_row == camera, local:-1]
         own[k, :, k] += J.T @ J
     return own
-
-
-def _prior_equations(system: LinearSystem) -> tuple[Array, Array]:
-    """(S d, S d) information and (S d,) gradient of the priors of the estimated cameras."""
-    d, (information, gradient) = len(system.problem.free), system.priors
-    rows = np.ravel(np.array(system.problem.estimated_cameras(), np.intp)[:, None] * d + np.arange(d))
-    return information[np.ix_(rows, rows)], gradient[rows]
 
 
 def _equal_blocks(rows: Array, bounds: Index) -> Iterator[tuple[Index, Array]]:

@@ -208,6 +208,11 @@ class Problem:
         """Indices of the S cameras that are estimated."""
         return tuple(range(len(self.lenses))) if self.estimated is None else self.estimated
 
+    def estimated_rows(self) -> Index:
+        """(S d,) the free parameters of the estimated cameras among those (C d,) of all."""
+        d = len(self.free)
+        return np.ravel(np.array(self.estimated_cameras(), np.intp)[:, None] * d + np.arange(d))
+
     def with_free(self, *parameters: tuple[int, ...]) -> "Problem":
         """The problem with these groups of camera parameters free."""
         return replace(self, free=tuple(sorted(sum(parameters, ()))))
