@@ -282,7 +282,7 @@ class RigMonitor:
             self._scale_claims(window, verdict, names)
         if names:
             self._size_m = _claim_m(window) * verdict.misfit**0.5
-            self._is_of_wand = verdict.cause == "wand"
+        self._is_of_wand = verdict.cause == "wand"
         self._note_undecided(names if self._n_undecided >= CONFIRMED else self._underrated())
         if not self._is_contradicted:
             return self._returned(window)
@@ -311,6 +311,7 @@ class RigMonitor:
             for k in verdict.cameras:
                 refinement.free_lens(k)
         refinement.update(*measured)
+        self._measured_ns = self._given_ns
         if not refinement.is_significant:
             return None
         refined = refinement.correct(self.pinned)
