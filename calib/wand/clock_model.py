@@ -46,6 +46,7 @@ SHIFTS = np.concatenate([-SHIFT_SIZES[::-1], [0.0], SHIFT_SIZES])  # seconds, th
 MAX_DEVIATION = 100.0  # sigmas: larger ones count as this
 AGREEMENT = 2.0  # factor within which the shift and the adjustment must agree on the jump
 MIN_FRAMES = 10  # of the camera on either side of the jump: fewer do not determine its pose
+NEAR_S = 3.0  # from the first time of a jump, within which the final one is searched
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +219,11 @@ def _confirm(
         background=BackgroundPoints.none(),
     )
     start = State(state.cameras[split], clocks, state.lenses[split], state.motion)
-    start = optimize_robustly(two, _split(observations, camera, change.t_s, after), start)
-    # The first time is found along a motion that is adjusted to both parts of the clock.
+    # The time is found along the motion that the other cameras show: that of both parts of the clock bends to the first
+    # one.
+    is_near = (observations.camera == camera) & (np.abs(observations.t_s - change.t_s) < NEAR_S)
+    shown = observations.select(np.flatnonzero(~is_near))
+    start = optimize_robustly(two, _split(shown, camera, change.t_s, after), start)
     at_s = _find_boundary(two, observations, start, camera)
     adjusted = adjust(two, _split(observations, camera, at_s, after), start)
     jump, variance = _clock_difference(adjusted, camera, at_s)
