@@ -23,7 +23,7 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
 from fusion.model.observations import MatchedObservations
-from fusion.model.states import OMEGA, VELOCITY, States
+from fusion.model.states import OMEGA, POSITION, VELOCITY, States
 
 # The errors of a camera by their columns (`calib.rig.camera_errors`).
 CAUSES: dict["Cause", slice] = {"pose": slice(0, 6), "clock": slice(6, 7), "focal": slice(7, 8)}
@@ -32,6 +32,7 @@ Cause = Literal["pose", "clock", "focal", "wand"]
 # jumps of a clock.
 FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [0.1, 0.1])
 WAND_SIGMA = 0.05  # of the rig's size, if the lengths of the wand are wrong
+SHAPE_M = 1e-3  # of a marker's position in robots.yaml, measured by hand
 POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
 RIVAL = 1e-3  # likelihood of another explanation, relative to the accepted one
@@ -155,7 +156,8 @@ class Fit:
         bodies: (B, 12) errors of the bodies, to be applied to `Window.states`.
         prior: (8 C, 8 C) information about the errors by the calibration, where they are not free.
         reduced: (8 C, 8 C + 1) normal equations of the errors by the observations, robots eliminated.
-        by_camera: (N, 2, 8) whitened derivatives of the observations by the errors of their cameras.
+        rows: (N, 2, 12 + 8 + 1) whitened derivatives of the observations by the errors of their bodies and cameras, and
+            residuals.
         squared: (N,) squared whitened residuals; NaN where the disc is not visible.
     """
 
@@ -166,13 +168,45 @@ class Fit:
     bodies: Array
     prior: Array
     reduced: Array
-    by_camera: Array
+    rows: Array
     squared: Array
+
+    @property
+    def by_camera(self) -> Array:
+        """(N, 2, 8) whitened derivatives of the observations by the errors of their cameras."""
+        return self.rows[:, :, 12:-1]
 
     @property
     def equations(self) -> tuple[Array, Array]:
         """Least squares H e = y, (8 C, 8 C) and (8 C,), about the errors by the observations alone."""
         H, g = self.reduced[:, :-1], self.reduced[:, -1]
+        return H / self.variance, (g + H @ self.errors.ravel()) / self.variance
+
+    def equations_of_unknown_shapes(self, window: Window) -> tuple[Array, Array]:
+        """The same, if each marker may be `SHAPE_M` off its place on its robot, in all keyframes the same: bodies and
+        then markers are eliminated."""
+        discs, C = window.observations.discs, ERRORS * len(window.names)
+        marker = np.unique(discs.marker, return_inverse=True)[1]
+        shapes = slice(C, C + 3 * (int(marker.max(initial=-1)) + 1))
+        k, R = np.arange(len(marker))[:, None], window.states.retract(self.bodies).R[discs.body]
+        columns = np.zeros((len(marker), 2, shapes.stop + 1))  # of cameras and markers, and residuals
+        columns[k, :, ERRORS * window.camera[:, None] + np.arange(ERRORS)] = self.by_camera.transpose(0, 2, 1)
+        columns[k, :, C + 3 * marker[:, None] + np.arange(3)] = (self.rows[:, :, POSITION] @ R).transpose(
+            0, 2, 1
+        )
+        columns[:, :, -1] = self.rows[:, :, -1]
+        weights, priors = 1 / (1 + np.nan_to_num(self.squared) / _core.CAUCHY**2), _body_prior(window)
+        H = np.einsum("n,nai,naj->ij", weights, columns, columns, optimize=True)
+        for b, prior in enumerate(priors):
+            mine = discs.body == b
+            J, rest = self.rows[mine, :, :12].reshape(-1, 12), columns[mine].reshape(-1, columns.shape[2])
+            weighted = J.T * np.repeat(weights[mine], 2)
+            cross = weighted @ rest
+            cross[:, -1] -= prior * self.bodies[b]
+            H -= cross.T @ np.linalg.solve(weighted @ J + np.diag(prior), cross)
+        known = H[shapes, shapes] + np.eye(shapes.stop - C) / SHAPE_M**2
+        H = H - H[:, shapes] @ np.linalg.solve(known, H[shapes])
+        H, g = H[:C, :C], H[:C, -1]
         return H / self.variance, (g + H @ self.errors.ravel()) / self.variance
 
     @property
@@ -417,7 +451,7 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
         stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
         penalty += np.log(2 * len(at.squared)) + larger - stated
     found = at.errors, at.bodies, at.prior
-    return Fit(hypothesis, at.cost, penalty, *found, reduced, at.rows[:, :, 12:-1], at.squared)
+    return Fit(hypothesis, at.cost, penalty, *found, reduced, at.rows, at.squared)
 
 
 def _prior(window: Window, hypothesis: Hypothesis) -> Array:

@@ -310,7 +310,7 @@ class RigMonitor:
         if verdict.cause == "focal":
             for k in verdict.cameras:
                 refinement.free_lens(k)
-        refinement.update(*measured)
+        refinement.update(*measured, len(np.unique(window.observations.discs.marker)))
         self._measured_ns = self._given_ns
         if not refinement.is_significant:
             return None
@@ -592,7 +592,7 @@ def _measure(
     shown = window.select(is_new)
     if not len(shown.camera):
         return None
-    return int(times[is_new].mean()), *fit(shown, verdict.fit.hypothesis).equations
+    return int(times[is_new].mean()), *fit(shown, verdict.fit.hypothesis).equations_of_unknown_shapes(shown)
 
 
 def _seeing(window: Window) -> list[str]:

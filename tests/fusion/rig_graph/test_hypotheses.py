@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 
 from fusion import _core
-from fusion.rig_graph.hypotheses import CAUSES, ERRORS, Hypothesis, decide, is_contradicted, retract
+from fusion.rig_graph import hypotheses
+from fusion.rig_graph.hypotheses import (
+    CAUSES,
+    ERRORS,
+    Hypothesis,
+    Window,
+    decide,
+    fit,
+    is_contradicted,
+    retract,
+)
 from tests.fusion.native.scene import ARRAY, CAMERAS, scene
 from tests.fusion.rig_graph.fits import fitted
 
@@ -150,3 +160,37 @@ def test_errors_of_a_cause_are_free_and_no_others():
         free = Hypothesis.of(cause, (1,), 3).free
         assert free[1, columns].all()
         assert free.sum() == len(range(*columns.indices(ERRORS)))
+
+
+def test_markers_that_may_be_off_their_places_show_less_of_the_cameras(monkeypatch: pytest.MonkeyPatch):
+    """Nothing more in any direction, and as much where the places are known."""
+    window = window_of_scene()
+    found = fit(window, Hypothesis.of(None, (), len(CAMERAS)))
+    (H, y), (unknown, _) = found.equations, found.equations_of_unknown_shapes(window)
+    scale = np.sqrt(np.diag(H)) + 1e-9
+    more = np.linalg.eigvalsh((unknown - H) / np.outer(scale, scale))
+    assert more.max() < 1e-9
+    assert more.min() < -0.01
+    monkeypatch.setattr(hypotheses, "SHAPE_M", 1e-9)
+    known, y_known = found.equations_of_unknown_shapes(window)
+    np.testing.assert_allclose(known / np.outer(scale, scale), H / np.outer(scale, scale), atol=1e-9)
+    np.testing.assert_allclose(y_known / scale, y / scale, atol=1e-9 * np.abs(y / scale).max())
+
+
+def window_of_scene() -> Window:
+    """The scene as a keyframe, its detections a pixel of noise off."""
+    states, seen = scene()
+    T, n = np.array([camera.matrix() for camera in CAMERAS.values()]), len(states)
+    return Window(
+        names=tuple(CAMERAS),
+        T=T,
+        prior=ARRAY.covariance,
+        since=np.full(ERRORS * len(CAMERAS), 1e-12),
+        states=states,
+        velocity_sigma=np.full((n, 2), 1e-3),
+        moving=np.ones(n, bool),
+        single=np.zeros(n, bool),
+        observations=seen,
+        by_focal=np.ascontiguousarray(seen.detections.xy),
+        keyframe=np.zeros(n, np.intp),
+    )
