@@ -16,7 +16,7 @@ from camera_node.geometry.lens import Lens
 # logarithm of the focal length.
 ERRORS = 8
 PARAMETERS = (*POSE, *OFFSET, LENS[0])  # the same, as `calib.rig.camera` numbers them
-POSITION = slice(3, 6)
+POSITION = slice(3, 6)  # of its errors
 OF_IMAGE = np.arange(ERRORS) != 6  # all but the clock's displace the image of a point at rest
 MAX_JOINT = 16  # cameras whose covariances between each other fit into a rig's message: 16,384 numbers
 DIGITS = 6  # of a number in the file

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from calib.rig.camera import Camera
+from calib.rig.camera_errors import POSITION
 from calib.rig.rig import Rig
 
 CORRECTED = "corrected"  # the entry of the cameras that were corrected last, and when
@@ -42,12 +43,14 @@ class RigRefinement:
 
     Attributes:
         rig: all cameras in use, with their errors from now on.
-        errors_px: by which the images of each camera were off, RMS of a coordinate.
-        errors: (8,) of the camera that was off most (`calib.rig.camera_errors`).
+        worst: the camera that was off most.
+        off_px: by which its images were off, RMS of a coordinate.
+        errors: (8,) by which it was off (`calib.rig.camera_errors`).
     """
 
     rig: Mapping[str, Camera]
-    errors_px: Mapping[str, float]
+    worst: str
+    off_px: float
     errors: tuple[float, ...]
 
     @property
@@ -56,10 +59,9 @@ class RigRefinement:
         return self.rig
 
     def __str__(self) -> str:
-        worst = max(self.errors_px, key=self.errors_px.__getitem__)
-        turn, shift = np.degrees(np.linalg.norm(self.errors[:3])), 1e3 * np.linalg.norm(self.errors[3:6])
+        turn, shift = np.degrees(np.linalg.norm(self.errors[:3])), 1e3 * np.linalg.norm(self.errors[POSITION])
         return (
-            f"the rig is refined by up to {self.errors_px[worst]:.2f} px: camera {worst} by {turn:.3f} degrees, "
+            f"the rig is refined by up to {self.off_px:.2f} px: camera {self.worst} by {turn:.3f} degrees, "
             f"{shift:.1f} mm and {100 * self.errors[7]:+.2f} % of its focal length"
         )
 

@@ -36,6 +36,8 @@ SHAPE_M = 1e-3  # of a marker's position in robots.yaml, measured by hand
 POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
 RIVAL = 1e-3  # likelihood of another explanation, relative to the accepted one
+LARGE = 2.0  # ratio of errors to those that the rig states, from which it is reported or corrected
+CONFIRMED = 3  # judgements in a row, of which one may be by chance
 MAX_ITERATIONS, CONVERGED = 20, 1e-4  # relative decrease of the cost
 FIRST_DAMPING = 1e-4
 BEHIND = 1e6  # squared residual of a disc that is behind its camera
@@ -114,8 +116,8 @@ class Window:
 class Hypothesis:
     """The errors (C, 8) that are free, and where the search for them begins (C, 8); `cameras` are those at fault.
 
-    The standard deviations of all other errors are `scale` times those of the calibration. Of the cause "wand" is an
-    error that all cameras have in common: the size of the rig.
+    The standard deviations of all other errors are `scale` times those of the calibration. If `has_other_size`, the
+    size of the whole rig is free as well.
     """
 
     cause: Cause | None
@@ -123,6 +125,7 @@ class Hypothesis:
     free: Mask
     start: Array
     scale: float = 1.0
+    has_other_size: bool = False
 
     @classmethod
     def of(
@@ -130,7 +133,7 @@ class Hypothesis:
     ) -> "Hypothesis":
         """Errors of one cause in some cameras; without a cause, none or all errors of these cameras."""
         free = np.zeros((n_cameras, ERRORS), bool)
-        free[list(cameras), CAUSES.get(cause, slice(0, ERRORS)) if cause else slice(0, ERRORS)] = True
+        free[list(cameras), CAUSES[cause] if cause else slice(0, ERRORS)] = True
         begin = np.zeros((n_cameras, ERRORS)) if start is None else np.where(free, start, 0.0)
         return cls(cause, tuple(cameras), free, begin)
 
@@ -141,8 +144,13 @@ class Hypothesis:
 
     def is_part_of(self, other: "Hypothesis") -> bool:
         """Whether the other one frees all that this one does."""
-        is_of_wand = self.cause == "wand" != other.cause
-        return bool((self.free <= other.free).all()) and self.scale in (1.0, other.scale) and not is_of_wand
+        is_free = (self.free <= other.free).all() and self.has_other_size <= other.has_other_size
+        return bool(is_free) and self.scale in (1.0, other.scale)
+
+    @property
+    def n_free(self) -> int:
+        """The number of free parameters."""
+        return int(self.free.sum()) + self.has_other_size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,7 +187,10 @@ class Fit:
     @property
     def equations(self) -> tuple[Array, Array]:
         """Least squares H e = y, (8 C, 8 C) and (8 C,), about the errors by the observations alone."""
-        H, g = self.reduced[:, :-1], self.reduced[:, -1]
+        return self._about_errors(self.reduced)
+
+    def _about_errors(self, reduced: Array) -> tuple[Array, Array]:
+        H, g = reduced[:, :-1], reduced[:, -1]
         return H / self.variance, (g + H @ self.errors.ravel()) / self.variance
 
     def equations_of_unknown_shapes(self, window: Window) -> tuple[Array, Array]:
@@ -205,9 +216,8 @@ class Fit:
             cross[:, -1] -= prior * self.bodies[b]
             H -= cross.T @ np.linalg.solve(weighted @ J + np.diag(prior), cross)
         known = H[shapes, shapes] + np.eye(shapes.stop - C) / SHAPE_M**2
-        H = H - H[:, shapes] @ np.linalg.solve(known, H[shapes])
-        H, g = H[:C, :C], H[:C, -1]
-        return H / self.variance, (g + H @ self.errors.ravel()) / self.variance
+        H -= H[:, shapes] @ np.linalg.solve(known, H[shapes])
+        return self._about_errors(np.delete(H[:C], shapes, axis=1))
 
     @property
     def variance(self) -> float:
@@ -217,7 +227,7 @@ class Fit:
     def noise(self) -> float:
         """Variance of a whitened residual, with the parameters counted that took their share of the observations; not
         below 1, infinite if nothing is left."""
-        determined = CAUSES["pose"].stop * len(self.bodies) + int(self.hypothesis.free.sum())
+        determined = CAUSES["pose"].stop * len(self.bodies) + self.hypothesis.n_free
         left = 1 - determined / (2 * max(1, int(np.isfinite(self.squared).sum())))
         return max(1.0, self._median() / left) if left > 0 else np.inf
 
@@ -346,7 +356,8 @@ def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Seq
     if moved:
         return decide([*as_stated, fit(window, Hypothesis.of("pose", moved, n, starts))], seeing, moved)
     fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in seeing]
-    fits += [fit(window, Hypothesis.of("focal", seeing, n)), fit(window, Hypothesis.of("wand", (), n))]
+    other_size = replace(as_stated[0].hypothesis, cause="wand", has_other_size=True)
+    fits += [fit(window, Hypothesis.of("focal", seeing, n)), fit(window, other_size)]
     if len(seeing) > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
@@ -445,8 +456,7 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
         if is_converged:
             break
     reduced, _ = _eliminate(window, at, 0.0)
-    n_free = int(hypothesis.free.sum()) + (hypothesis.cause == "wand")
-    penalty = float(n_free * np.log(2 * len(at.squared)))
+    penalty = float(hypothesis.n_free * np.log(2 * len(at.squared)))
     if hypothesis.scale != 1.0:
         stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
         penalty += np.log(2 * len(at.squared)) + larger - stated
@@ -459,7 +469,7 @@ def _prior(window: Window, hypothesis: Hypothesis) -> Array:
     held = ~hypothesis.free.ravel()
     covariance = window.covariance(hypothesis.scale) * np.outer(held, held)
     covariance += np.diag((hypothesis.free * FREE_SIGMA**2).ravel())
-    if hypothesis.cause == "wand":
+    if hypothesis.has_other_size:
         covariance += WAND_SIGMA**2 * np.outer(window.growth, window.growth)
     return np.asarray(np.linalg.inv(covariance), float)
 

@@ -31,8 +31,10 @@ from fusion.model.corrections import RigRefinement
 from fusion.rig_graph.clock_walk import OFFSET_SIGMA_S
 from fusion.rig_graph.hypotheses import (
     CAUSES,
+    CONFIRMED,
     FALSE_ALARM,
     FREE_SIGMA,
+    LARGE,
     MIN_FOR_PAIRS,
     RIVAL,
     SHAPE_M,
@@ -40,9 +42,9 @@ from fusion.rig_graph.hypotheses import (
 )
 from fusion.rig_graph.keyframes import GATES_PX
 
-MEMORY_S = 60.0  # in which errors wander as far as the calibration states
-LARGE = 2.0  # ratio of errors in the image, those that are corrected over those that are stated
-CONFIRMED = 3  # windows in a row that contradict what is known, before that is forgotten
+# In which errors wander as far as the calibration states: about seven windows count, so an estimate is four seconds
+# old, in which a camera that turns by half a degree an hour moves the image by 0.01 px.
+MEMORY_S = 60.0
 
 
 class Refinement:
@@ -80,13 +82,11 @@ class Refinement:
     def free_lens(self, k: int) -> None:
         """The focal length of a camera is another one."""
         row = ERRORS * k + CAUSES["focal"].start
-        self.P = self.P.copy()
         self.P[row, row] += FREE_SIGMA[CAUSES["focal"]][0] ** 2
 
     def _free(self, k: int) -> None:
         """The pose or the lens of a camera is another one."""
         rows = ERRORS * k + np.flatnonzero(OF_IMAGE)
-        self.P = self.P.copy()
         self.P[np.ix_(rows, rows)] += (GATES_PX[-1] / USUAL_PX) ** 2 * self._own[np.ix_(rows, rows)]
         self._freed.add(k)
 
@@ -116,12 +116,12 @@ class Refinement:
 
     def _wander(self, dt: float) -> None:
         """An Ornstein-Uhlenbeck process about the rig in use."""
-        kept = np.exp(-dt / MEMORY_S)
-        self.x, self.P = kept * self.x, kept**2 * self.P + (1 - kept**2) * self._prior
+        decay = np.exp(-dt / MEMORY_S)
+        self.x, self.P = decay * self.x, decay**2 * self.P + (1 - decay**2) * self._prior
 
     def _agrees(self, H: Array, off: Array) -> bool:
         """Whether a window agrees with what is known, or shows which camera changed: its pose and its lens are free
-        from then on, since one place of the robots does not tell them apart.
+        from then on, since robots at one place do not distinguish them.
 
         Of three cameras, two that moved together look like the third; a clock is that of `ClockWalk`.
 
@@ -166,26 +166,23 @@ class Refinement:
     def _image_px(self, covariance: Array) -> Array:
         return np.sqrt(np.einsum("kij,kij->k", own_blocks(covariance), self._metrics))
 
-    def correct(self, kept: Collection[str]) -> RigRefinement:
-        """Correct all cameras but some by their estimated errors, which count from the corrected poses on. A lens is as
-        it was where that is negligible."""
-        off_px, errors = self.off_px, self.x.reshape(-1, ERRORS).copy()
-        errors[[name in kept for name in self.cameras]] = 0.0
-        errors[:, 6] = 0.0
-        focal_px = np.sqrt(self._metrics[:, 7, 7]) * np.abs(errors[:, 7])
-        errors[focal_px < USUAL_PX, 7] = 0.0
+    def correct(self, pinned: Collection[str]) -> RigRefinement:
+        """Correct all cameras that are not pinned by their estimated errors, which count from the corrected poses on. A
+        lens is as it was where its error is negligible."""
+        errors = self.x.reshape(-1, ERRORS) * OF_IMAGE
+        errors[[name in pinned for name in self.cameras]] = 0.0
+        errors[np.sqrt(self._metrics[:, 7, 7]) * np.abs(errors[:, 7]) < USUAL_PX, 7] = 0.0
         self.x = self.x - errors.ravel()
-        joint = self.P + self._own_now + np.outer(self.x, self.x)
-        clocks = np.arange(6, len(self.x), ERRORS)
+        joint, clocks = self.P + self._own_now + np.outer(self.x, self.x), ~np.tile(OF_IMAGE, len(errors))
         joint[clocks], joint[:, clocks] = self._stated[clocks], self._stated[:, clocks]
         self._stated, self._scale = joint, 1.0
         self._freed.clear()
         pairs = zip(self.cameras.items(), errors, strict=True)
         self.cameras = with_errors({name: _displaced(camera, e) for (name, camera), e in pairs}, joint)
-        worst = errors[np.argmax(off_px)].tolist()
-        return RigRefinement(
-            self.cameras, dict(zip(self.cameras, off_px.tolist(), strict=True)), tuple(worst)
-        )
+        off_px = self._image_px(np.outer(errors, errors))
+        worst = int(np.argmax(off_px))
+        name, of_worst = list(self.cameras)[worst], tuple(errors[worst].tolist())
+        return RigRefinement(self.cameras, name, float(off_px[worst]), of_worst)
 
 
 def _displaced(camera: Camera, errors: Array) -> Camera:

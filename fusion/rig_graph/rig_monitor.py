@@ -38,7 +38,9 @@ from fusion.protocol.pose_messages import Contradiction
 from fusion.rig_graph.clock_walk import ClockWalk, Departure
 from fusion.rig_graph.hypotheses import (
     CAUSES,
+    CONFIRMED,
     FALSE_ALARM,
+    LARGE,
     MIN_FOR_PAIRS,
     Fit,
     Hypothesis,
@@ -67,10 +69,8 @@ CHANGED = 2.0  # ratio of the mean robust costs in both halves of a window in wh
 USUAL = (
     0.2  # mean robust cost that shows nothing: twice that of Gaussian noise, E[log(1 + chi2_2 / CAUCHY^2)]
 )
-CONFIRMED = 3  # checks that do not decide, before that is reported
 MAX_SIGMA_PX = 0.3  # of an accepted pose, at the markers that show it
 MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be far off either
-LARGE = 2.0  # factor of the rig's errors that is reported
 # Of that factor in a window that contradicts nothing: it shows a part of the arena; one in which all cameras take part
 # that contradicted each other shows that they agree again.
 FALL, AGREED_FALL = 0.5**0.125, 0.5
@@ -315,8 +315,7 @@ class RigMonitor:
         if not refinement.is_significant:
             return None
         refined = refinement.correct(self.pinned)
-        for name in window.names:
-            self._remember(name, self._cameras[name])
+        self._remember_all()
         self._use_all()
         self._refinement = refinement
         return refined
@@ -410,8 +409,7 @@ class RigMonitor:
     def _place(self, window: Window, best: Fit, k: int) -> ExtrinsicsCorrection | None:
         """The camera with the first of its known poses that explains the window, or else with that of the fit."""
         name = window.names[k]
-        for other in window.names:
-            self._remember(other, self._cameras[other])
+        self._remember_all()
         for pose in self._known[name]:
             if pose == self._cameras[name].T_world_cam:
                 continue
@@ -433,6 +431,10 @@ class RigMonitor:
         joint = best.joint_covariance(window.prior, k)
         rig = with_errors(self._cameras.as_dict() | {name: camera}, joint)
         return ExtrinsicsCorrection(name, rig[name], rig=rig)
+
+    def _remember_all(self) -> None:
+        for name, camera in self._cameras.as_dict().items():
+            self._remember(name, camera)
 
     def _remember(self, name: str, camera: Camera) -> None:
         known = self._known.setdefault(name, [])

@@ -286,19 +286,21 @@ class Server:
 
     def _report_correction(self, correction: ExtrinsicsCorrection | RigRefinement) -> None:
         """Log a change of the cameras; publish the rig if they have other poses, by the server that has the rig."""
-        undo = "roundel undo reverts that"
         if correction.placed:
             self.pipeline.correct_rig(correction, self.clock.now_ns())
             if self.pipeline.active_rig.message is not None:
                 self.transport.publish(self.keys.rig, self.pipeline.active_rig.message)
         if isinstance(correction, RigRefinement):
-            log.warning("%s; %s", correction, undo)
-        elif correction.camera is None:
-            self.statistics.note_moved(correction.name)
+            log.warning("%s; roundel undo reverts that", correction)
+            return
+        name = correction.name
+        if correction.camera is None:
+            self.statistics.note_moved(name)
+        elif correction.has_returned:
+            log.warning("camera %s is at a known pose, and used again", name, extra=about(name))
         else:
-            change = f"recalibrated and used again; {undo}"
-            change = "at a known pose, and used again" if correction.has_returned else change
-            log.warning("camera %s is %s", correction.name, change, extra=about(correction.name))
+            change = "camera %s is recalibrated and used again; roundel undo reverts that"
+            log.warning(change, name, extra=about(name))
 
     def _report_status(self, now_ns: int) -> FusionStatus | None:
         """Publish the status once a second; return it if it was due."""

@@ -321,10 +321,9 @@ class OwnDetections:
         found, lost = np.zeros(self._shape[1], bool), missing.sum(0) > count.sum(0)
         for k in np.flatnonzero(lost).tolist():
             robots = given.tracked & (self._usual[:, k] > 0)
-            here = count[robots][:, ~lost].sum(0), missing[robots][:, ~lost].sum(0)
-            if not (
-                here[0] > here[1]
-            ).any():  # no other camera shows that the robots are where they are predicted
+            of_others = np.ix_(robots, ~lost)
+            # Whether another camera shows that the robots are where they are predicted.
+            if not (count[of_others].sum(0) > missing[of_others].sum(0)).any():
                 continue
             rows = np.flatnonzero(robots[self._markers.robot])
             elsewhere = self._shifted(given, k, rows)

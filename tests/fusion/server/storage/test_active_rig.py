@@ -164,7 +164,7 @@ def test_undo_of_a_refinement_restores_the_rig_and_no_longer_refines_it(tmp_path
     """Moved cameras are found as before; a new calibration may be refined again."""
     with serving(saving(tmp_path)) as (server, client):
         cameras = dict(ARENA.cameras) | {"cam1": MOVED}
-        refinement = RigRefinement(cameras, dict.fromkeys(cameras, 0.2), (0.0,) * 8)
+        refinement = RigRefinement(cameras, "cam1", 0.2, (0.0,) * 8)
         server.transport.enqueue(lambda: server.pipeline.correct_rig(refinement, 1))
         wait_for(lambda: (rig := client.rig(DEADLINE_S)) and rig.cameras["cam1"] == MOVED)
         where = ("--connect", server.endpoints[0], "--arena", "test")
