@@ -442,11 +442,17 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
     clocks = choose_clocks(coarse, recording.timing)
     fine = _prepare_fine(recording, rough, coarse, clocks)
     solution = _adjust_finely(fine, coarse.inflation)
-    check_agreement(recording.names, solution.adjusted, solution.observations)
-    if rough.metric:
-        check_sizes(recording.wand, solution.adjusted, solution.observations)
-        check_spacing(recording.wand, solution.adjusted, solution.observations)
-    return _validate(recording, solution)
+    try:
+        check_agreement(recording.names, solution.adjusted, solution.observations)
+        if rough.metric:
+            check_sizes(recording.wand, solution.adjusted, solution.observations)
+            check_spacing(recording.wand, solution.adjusted, solution.observations)
+        return _validate(recording, solution)
+    except CameraFault as fault:
+        jump = find_jump(recording.names, solution.adjusted, solution.observations)
+        if jump is None or jump.camera not in fault.reasons:
+            raise
+        raise CameraFault({jump.camera: jump.sentence()}, fault.certain) from None
 
 
 def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Adjusted:
@@ -510,9 +516,6 @@ def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: Wand
     share[fitting == total] = 1.0
     if share.min() < MIN_AGREEING:
         k = int(share.argmin())
-        jump = find_jump(names, adjusted, observations)
-        if jump is not None and jump.camera == names[k]:
-            raise CameraFault({names[k]: jump.sentence()}, certain=False)
         reason = (
             f"only {fitting[k]} of its {total[k]} detections fit those of the other cameras: if it has few, wave the "
             "wand in front of it; else check that its name and its intrinsics are its own and that it did not move; "

@@ -8,7 +8,8 @@ A clock may jump during the recording, set by a time service or a frame counter.
 observations fit the others' at different shifts of its stamps. The jump's time and the two shifts are those that fit
 best of all (a change point by least absolute deviations: Bai 1995). To confirm it, that camera is adjusted as two
 cameras, before and after the jump, each with its own pose and clock: the jump is the difference of their clocks, and
-its covariance gives its significance.
+its covariance gives its significance. A camera that moved differs in its pose instead, and that of equal poses or that
+of equal clocks is the likelier hypothesis.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT
-from calib.rig.estimation import CHANCE, CLEAR
+from calib.rig.estimation import CHANCE, CLEAR, MARGIN
 from calib.wand.bundle_adjustment.covariance import (
     camera_covariance,
     inverse_information,
@@ -36,6 +37,7 @@ from calib.wand.bundle_adjustment.residuals import find_weights, whitened_errors
 from calib.wand.detections import Timing
 from calib.wand.wand_report import ClockJump
 from camera_node.foundation.arrays import Array, Index
+from camera_node.geometry.pose import invert, vector_from_rotation
 
 MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
 # A jump that does not disturb the rig leaves neither: the rejected share of a camera's observations, and its drift,
@@ -202,7 +204,8 @@ def _confirm(
     observations: WandObservations,
     state: State,
 ) -> ClockJump | None:
-    """Adjust the camera as two, the one after the change being the last; None if the jump is not significant."""
+    """Adjust the camera as two, the one after the change being the last; None if the jump is not significant, or if the
+    camera moved instead."""
     from scipy.special import chdtrc
 
     camera, after = change.camera, len(names)
@@ -230,7 +233,11 @@ def _confirm(
     by_chance = chdtrc(1, jump**2 / variance) * len(observations)
     if by_chance > CHANCE or not 1 / AGREEMENT < -jump / change.by_s < AGREEMENT:
         return None
-    return ClockJump(names[camera], 1e3 * jump, 1e3 * variance**0.5, at_s)
+    # What the hypothesis of equal clocks adds to the squared deviations of the recording, less what equal poses add.
+    margin = jump**2 / variance - _squared_motion(adjusted, camera)
+    if margin < -MARGIN:
+        return None
+    return ClockJump(names[camera], 1e3 * jump, 1e3 * variance**0.5, at_s, or_moved=margin < MARGIN)
 
 
 def _split(observations: WandObservations, camera: int, at_s: float, new: int) -> WandObservations:
@@ -258,3 +265,15 @@ def _clock_difference(adjusted: Adjusted, camera: int, at_s: float) -> tuple[flo
     joint = camera_covariance(adjusted).of((*OFFSET, *DRIFT))
     covariance = joint[np.ix_(ends, range(2), ends, range(2))].reshape(4, 4)
     return float(by_clock @ adjusted.state.clocks[ends, :2].ravel()), float(by_clock @ covariance @ by_clock)
+
+
+def _squared_motion(adjusted: Adjusted, camera: int) -> float:
+    """Squared Mahalanobis distance of the poses of `camera` and of the last camera."""
+    ends = [camera, len(adjusted.problem.lenses) - 1]
+    before, after = adjusted.state.cameras[ends]
+    change = invert(before) @ after
+    difference = np.append(vector_from_rotation(change[:3, :3]), change[:3, 3])
+    joint = camera_covariance(adjusted).of(POSE)[np.ix_(ends, range(6), ends, range(6))]
+    sign = np.array([1.0, -1.0])
+    covariance = np.einsum("a,apbq,b->pq", sign, joint, sign)
+    return float(difference @ np.linalg.solve(covariance, difference))

@@ -65,18 +65,20 @@ class Exchange:
 @dataclass(frozen=True, slots=True)
 class ClockJump:
     """A jump of a camera's timestamps by `ms` with standard deviation `sigma_ms`, at `at_s`, seconds after the first
-    frame of the recording."""
+    frame of the recording; `or_moved` where the recording may as well show that the camera moved then."""
 
     camera: str
     ms: float
     sigma_ms: float
     at_s: float
+    or_moved: bool = False
 
     def sentence(self) -> str:
         """State the jump and its remedy."""
+        moved = ", or it moved then, which the recording does not tell apart" if self.or_moved else ""
         return (
-            f"its clock jumps by {self.ms:+.1f} \N{PLUS-MINUS SIGN} {self.sigma_ms:.1f} ms at {self.at_s:.1f} s: make "
-            "sure that nothing sets it and that no frames are dropped, and wave the wand again"
+            f"its clock jumps by {self.ms:+.1f} \N{PLUS-MINUS SIGN} {self.sigma_ms:.1f} ms at {self.at_s:.1f} s{moved}: "
+            "make sure that nothing sets it and that no frames are dropped, and wave the wand again"
         )
 
     def as_dict(self) -> dict[str, float]:

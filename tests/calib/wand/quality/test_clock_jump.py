@@ -53,9 +53,11 @@ def test_a_clock_that_jumps_is_named(scenario: WandScenario, camera: str, ms: fl
     assert "its clock jumps by" in jump.sentence()
 
 
-def test_the_reason_of_a_camera_that_is_left_out_names_its_clock():
-    """A jump of 0.1 s half way: half of the camera's observations contradict the others."""
-    result = calibrated(replace(SHORT, seed=7), "cam03", SHORT.seconds / 2, 100.0)
+@pytest.mark.parametrize("seed", [6, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 2, 5, 7))])
+def test_the_reason_of_a_camera_that_is_left_out_names_its_clock(seed: int):
+    """A jump of 0.1 s half way: half of the camera's observations contradict the others. Another pose explains many of
+    them, of all but the last recording, but none as well as the jump."""
+    result = calibrated(replace(SHORT, seed=seed), "cam03", SHORT.seconds / 2, 100.0)
     assert "its clock jumps by +" in result.report.unplaced["cam03"]
     assert len(result.names) == 3
 
