@@ -77,8 +77,8 @@ class ClockJump:
         """State the jump and its remedy."""
         moved = ", or it moved then, which the recording does not tell apart" if self.or_moved else ""
         return (
-            f"its clock jumps by {self.ms:+.1f} \N{PLUS-MINUS SIGN} {self.sigma_ms:.1f} ms at {self.at_s:.1f} s{moved}: "
-            "make sure that nothing sets it and that no frames are dropped, and wave the wand again"
+            f"its clock jumps by {self.ms:+.1f} \N{PLUS-MINUS SIGN} {self.sigma_ms:.1f} ms at {self.at_s:.1f} "
+            f"s{moved}: make sure that nothing sets it and that no frames are dropped, and wave the wand again"
         )
 
     def as_dict(self) -> dict[str, float]:
