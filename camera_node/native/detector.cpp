@@ -248,6 +248,7 @@ bool Detector::decide(FrameState& frame) {
         frame.image = camera_.linearize(frame.encoded);
         for (TrackedFit& roundel : frame.found) raise_levels(roundel.fit, camera_.exponent_in_use() / before);
         frame.noise = noise_level(frame.image);
+        frame.density.reset();
     }
     for (const RoundelFit& fit : frame.undecided)
         fit_and_accept(
@@ -305,7 +306,10 @@ bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int trac
 bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const {
     if (!fit || frame.found.size() >= kMaxRoundels) return false;
     if (frame.suppression.contains(fit->outer.x, fit->outer.y)) return false;
-    if (track < 0 && refusal_of_new(*fit, frame.noise)) return false;
+    if (track < 0) {
+        if (!frame.density) frame.density = noise_density(frame.image);
+        if (refusal_of_new(frame.image, *fit, *frame.density)) return false;
+    }
     if (is_bullseye(frame.image, *fit, has_known_ratio(*fit, limits_))) return false;
     if (fit->provisional) {
         const auto is_same = [&](const RoundelFit& other) {

@@ -51,9 +51,10 @@ class Detector {
     /// What is found in one frame.
     struct FrameState {
         FrameState(const ImageView& given, const ImageView& linearized, bool known);
-        ImageView encoded, image;  // as the camera gives it, and with levels in proportion to light
-        double noise;              // of `image`, grey levels
-        bool decided;              // the camera is known as well as this frame shows it
+        ImageView encoded, image;         // as the camera gives it, and with levels in proportion to light
+        double noise;                     // of `image`, grey levels
+        std::optional<double> density{};  // `noise_density` of `image`, from the first new roundel on
+        bool decided;                     // the camera is known as well as this frame shows it
         Suppression suppression;
         std::vector<TrackedFit> found;
         std::vector<RoundelFit> undecided;  // until the camera is known

@@ -16,6 +16,7 @@ namespace {
 // Limits within which a shape is ring-like.
 constexpr double kMinDiameter = 6;
 constexpr double kMaxDiameter = 10000;
+constexpr double kRingSpan = 6;      // standard deviations of noise: least contrast
 constexpr double kSameCentre = 0.3;  // minor axes, for two ellipses of one ring
 constexpr double kSameSize = 1.5;    // factor, for two ellipses of one ring
 constexpr size_t kMaxCandidates = 4096;
@@ -39,7 +40,8 @@ std::optional<RefusedRing> refuse(const ImageView& image, const InitialGuess& gu
     start.camera.prints = {};
     if (const auto accepted = fit_roundel(image, start, context, false)) {
         const bool bullseye = is_bullseye(image, *accepted, has_known_ratio(*accepted, context.limits));
-        const auto reason = bullseye ? Refusal::kBullseye : refusal_of_new(*accepted, context.noise);
+        const auto reason =
+            bullseye ? Refusal::kBullseye : refusal_of_new(image, *accepted, noise_density(image));
         if (!reason) return std::nullopt;
         return RefusedRing{accepted->outer, accepted->ratio, accepted->contrast(), 0, *reason};
     }

@@ -4,12 +4,15 @@
 #include <algorithm>
 #include <array>
 #include <cstring>
+#include <numeric>
 
 #include "numeric/simd.hpp"
 
 namespace roundel {
 
 namespace {
+
+constexpr int kSquare = 4;  // pixels of a side, the width of the ring of a roundel of 20
 
 inline uint8_t least(uint8_t a, uint8_t b) { return a < b ? a : b; }
 inline uint8_t greatest(uint8_t a, uint8_t b) { return a > b ? a : b; }
@@ -27,24 +30,49 @@ int span_of(const ImageView& patch) {
     return *std::max_element(high, high + width) - *std::min_element(low, low + width);
 }
 
+/// What `measure` finds in the flattest of 256 patches of this size, a twentieth of which have less.
+template <int width, int height, typename Measure>
+double in_flat_patches(const ImageView& image, const Measure& measure) {
+    constexpr int kPatches = 16;    // in either direction
+    constexpr double kFlat = 0.05;  // share of the patches that are the flattest
+    if (image.width < width || image.height < height) return 0;
+    std::array<double, kPatches * kPatches> found;
+    for (int k = 0; k < kPatches * kPatches; ++k) {
+        const int x = (image.width - width) * (k % kPatches) / kPatches;
+        const int y = (image.height - height) * (k / kPatches) / kPatches;
+        found[size_t(k)] = measure(image.window(x, y, width, height));
+    }
+    const auto flat = found.begin() + ptrdiff_t(kFlat * double(found.size()));
+    std::nth_element(found.begin(), flat, found.end());
+    return *flat;
+}
+
+/// The variance of the sums of the 16 squares of a patch, for each of their 16 pixels.
+double density_of(const ImageView& patch) {
+    double sum = 0, squared = 0;
+    for (int y = 0; y < 4 * kSquare; y += kSquare)
+        for (int x = 0; x < 4 * kSquare; x += kSquare) {
+            int levels = 0;
+            for (int v = y; v < y + kSquare; ++v)
+                levels = std::accumulate(patch.row(v) + x, patch.row(v) + x + kSquare, levels);
+            sum += levels;
+            squared += double(levels) * levels;
+        }
+    return (squared - sum * sum / 16) / (15 * 16);
+}
+
 }  // namespace
 
 double noise_level(const ImageView& image) {
-    constexpr int kPatches = 16;         // in either direction
-    constexpr int kWidth = 8;            // of a patch, pixels
-    constexpr int kHeight = 4;           // of a patch, pixels
-    constexpr double kFlat = 0.05;       // share of the patches that are the flattest
     constexpr double kDeviations = 2.9;  // range of a flat patch, standard deviations
-    if (image.width < kWidth || image.height < kHeight) return 1;
-    std::array<int, kPatches * kPatches> spans;
-    for (int k = 0; k < kPatches * kPatches; ++k) {
-        const int x = (image.width - kWidth) * (k % kPatches) / kPatches;
-        const int y = (image.height - kHeight) * (k / kPatches) / kPatches;
-        spans[size_t(k)] = span_of<kWidth, kHeight>(image.window(x, y, kWidth, kHeight));
-    }
-    const auto flat = spans.begin() + ptrdiff_t(kFlat * double(spans.size()));
-    std::nth_element(spans.begin(), flat, spans.end());
-    return std::clamp(*flat / kDeviations, 1.0, 8.0);
+    return std::clamp(in_flat_patches<8, 4>(image, span_of<8, 4>) / kDeviations, 1.0, 8.0);
+}
+
+double noise_density(const ImageView& image) {
+    constexpr double kLeast = 0.484;  // of the mean: a twentieth of chi-square with 15 degrees of freedom
+    const double density = in_flat_patches<4 * kSquare, 4 * kSquare>(image, density_of) / kLeast;
+    const double in_blocks = kTile * noise_level(image);
+    return std::clamp(density, 1.0, in_blocks * in_blocks);
 }
 
 namespace {

@@ -28,6 +28,8 @@ constexpr double kThinRing = 3.6;
 constexpr double kBlackInk = 0.7;      // share of the paper's level below which ink is black
 constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of uneven light may leave
 constexpr double kLarge = 160;         // pixels: bends of 5 % are fitted up to this size
+constexpr double kFalseAlarms = 1e-4;  // rings that noise may make in a picture
+constexpr double kEnergyPixels = 100;  // of half axes squared, in which the energy of a ring is measured
 constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
@@ -192,8 +194,31 @@ static bool has_black_ink(const RoundelFit& fit) {
     return (1 - fit.ratio) * fit.outer.major / 2 >= kThinRing || fit.dark < kBlackInk * fit.bright;
 }
 
-std::optional<Refusal> refusal_of_new(const RoundelFit& fit, double noise) {
-    if (fit.contrast() < kRingSpan * noise) return Refusal::kContrast;
+/// The energy of a ring in the picture, squared grey levels times pixels: the squared difference of the mean
+/// levels of its ink and of the paper in and around it, times the pixels that determine the difference.
+static double ring_energy(const ImageView& image, const RoundelFit& fit) {
+    const Ellipse& e = fit.outer;
+    const double a = e.major / 2, b = e.minor / 2, c = std::cos(e.angle), s = std::sin(e.angle);
+    const double reach = kMinCard * a;
+    const int step = std::max(1, int(a * b / kEnergyPixels));
+    double n[2]{}, sum[2]{};
+    for (int v = std::max(0, int(e.y - reach)); v <= std::min(image.height - 1, int(e.y + reach)); ++v)
+        for (int u = std::max(0, int(e.x - reach)) + v % step;
+             u <= std::min(image.width - 1, int(e.x + reach)); u += step) {
+            const double x = u - e.x, y = v - e.y;
+            const double f = std::hypot((c * x + s * y) / a, (c * y - s * x) / b);
+            if (f > kMinCard) continue;
+            const bool ink = f > fit.ratio && f < 1;
+            n[ink] += step;
+            sum[ink] += step * double(image.row(v)[u]);
+        }
+    if (!(n[0] > 0 && n[1] > 0)) return 0;
+    return square(sum[0] / n[0] - sum[1] / n[1]) * n[0] * n[1] / (n[0] + n[1]);
+}
+
+std::optional<Refusal> refusal_of_new(const ImageView& image, const RoundelFit& fit, double density) {
+    const double places = double(image.width) * image.height;
+    if (ring_energy(image, fit) < 2 * std::log(places / kFalseAlarms) * density) return Refusal::kContrast;
     return has_black_ink(fit) ? std::nullopt : std::optional(Refusal::kPaleInk);
 }
 

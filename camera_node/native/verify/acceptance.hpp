@@ -27,11 +27,10 @@ enum class Refusal {
     kPaleInk       // a ring so thin that a thinner, black one may look the same
 };
 
-constexpr double kRingSpan = 6;  // standard deviations of noise: contrast of a ring that it does not make
-
-/// The test that a fit which passes all others fails as a new roundel, if any: noise explains all residuals
-/// of a ring that is as faint as itself, and a thin ring of pale ink looks like a thinner, black one.
-std::optional<Refusal> refusal_of_new(const RoundelFit& fit, double noise);
+/// The test that a fit which passes all others fails as a new roundel, if any: noise of this `density`
+/// (`noise_density`) makes rings of little energy somewhere in a picture, in which it explains all residuals,
+/// and a thin ring of pale ink looks like a thinner, black one.
+std::optional<Refusal> refusal_of_new(const ImageView& image, const RoundelFit& fit, double density);
 
 /// The limit that a fit exceeds, if any.
 std::optional<Refusal> exceeded_limit(const RoundelFit& fit, const RoundelLimits& limits);

@@ -44,7 +44,7 @@ Disturb = Callable[[Array, list[Card], np.random.Generator], Array]
 GROUNDS = ("even", "clutter")  # around the cards
 
 
-def acquainted(run: Run, sensor: Sensor) -> Detector:
+def acquainted(run: Run, sensor: Camera) -> Detector:
     """A detector that has learned a camera's response, and tracks nothing."""
     detector = run.make()
     for seed in range(3):

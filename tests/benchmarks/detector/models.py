@@ -13,6 +13,7 @@ from functools import partial
 from itertools import product
 
 import av
+import msgspec
 import numpy as np
 from rich.console import Console
 
@@ -58,6 +59,15 @@ CHANGED: dict[str, Camera] = {
     "gamma 2.2": Sensor(noise=2.0, tone="gamma"),
     "mild": MILD,
 }
+DARK: dict[str, Camera] = {
+    "mosaic": Sensor(noise=9.0, tone="gamma", bayer=True),
+    "denoised": Sensor(noise=9.0, tone="gamma", bayer=True, denoise_px=1.0),
+    "harsh camera": msgspec.structs.replace(HARSH, noise=9.0),
+    "second generator": second.Camera(colour=True, tone="srgb", iso_gain=6.0),
+}
+DARK_LEVELS = (2.0, 5.0, 15.0)  # linear
+DIM = msgspec.structs.replace(MILD, noise=5.0)
+DIM_PAPER = 35.0  # linear level
 CHANGES = (("gamma 2.2", "linear"), ("linear", "gamma 2.2"), ("mild", "linear"), ("linear", "mild"))
 SECOND = {
     "JPEG 75": Second(second.Camera(jpeg=75)),
@@ -161,6 +171,18 @@ def faint_found(known: Detector, count: int) -> float:
     return share_found(known, Sensor(noise=0.3, tone="gamma"), faint, count)
 
 
+def false_in_dark(detector: Detector, camera: Camera, level: float, frames: int, seed: int = 0) -> int:
+    """Roundels found in so many pictures of nothing but noise."""
+    rngs = (np.random.default_rng((6, seed, frame)) for frame in range(frames))
+    return sum(len(detector.adjusted().detect(camera.expose(flat(SIZE, level), rng))) for rng in rngs)
+
+
+def dim(rng: np.random.Generator) -> tuple[Array, list[Card]]:
+    """Cards in a dim room."""
+    shown = cards(rng)
+    return paste(flat(SIZE, DIM_PAPER / 2), shown, dark=DIM_PAPER / 7, bright=DIM_PAPER), shown
+
+
 def print_claims(run: Run, ratios: tuple[float, ...], count: int) -> Array:
     """Mean squared errors of the size over the claim, one for each ratio, after a stream of prints of all of them."""
     squared: list[list[float]] = [[] for _ in ratios]
@@ -232,6 +254,7 @@ def measure(run: Run, console: Console) -> list[Verdict]:
         *_first_frame(run, frames),
         *_second_generator(run, frames),
         *_learned(run, frames),
+        *_dark(run, frames),
         *_bent(run, 100 if run.thorough else 2 * frames),
         _judge_stream(*stream_and_fresh(run, 1 + frames // 4)),
         _judge_false(*false_detections(run, 100 * frames)),
@@ -327,6 +350,19 @@ def _learned(run: Run, frames: int) -> Iterator[Verdict]:
     for (what, camera), ratio in product(SHARPENED.items(), (0.3, 0.5, 0.7)):
         found = share_of_print(run, camera, ratio, frames)
         yield _judge(f"unknown print of {ratio}, {what}, second frame", found, 0.97, "19 to 64 %")
+
+
+def _dark(run: Run, frames: int) -> Iterator[Verdict]:
+    for what, camera in DARK.items():
+        for when, detector in (("fresh", run.make()), ("known", acquainted(run, camera))):
+            found = sum(false_in_dark(detector, camera, level, 2 * frames, run.seed) for level in DARK_LEVELS)
+            pictures = 2 * frames * len(DARK_LEVELS)
+            yield Verdict(
+                f"false detections, {pictures} dark pictures, {what}, {when}", str(found), "0", found == 0
+            )
+    for when, detector in (("fresh", run.make()), ("known", acquainted(run, DIM))):
+        found = share_found(detector, DIM, dim, frames, run.seed)
+        yield _judge(f"dim room, {when}", found, 0.9)
 
 
 def _bent(run: Run, count: int) -> Iterator[Verdict]:

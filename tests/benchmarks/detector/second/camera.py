@@ -32,12 +32,14 @@ class Camera:
             Narkowicz (2016) and sRGB.
         colour: whether a Bayer mosaic is interpolated linearly, sharpened, and compressed with halved chroma.
         jpeg: quality of Pillow's encoder.
+        iso_gain: how much less light the levels stand for, as the gain of a camera in a dark room makes them.
     """
 
     falls_off: bool = False
     tone: Tone = "linear"
     colour: bool = False
     jpeg: int | None = None
+    iso_gain: float = 1.0
 
     def expose(self, light: Array, rng: np.random.Generator) -> Grey:
         """The picture (h, w), uint8, of light (h, w) in linear levels of 255."""
@@ -49,8 +51,9 @@ class Camera:
             y, x = np.mgrid[:h, :w] - np.array([h - 1, w - 1])[:, None, None] / 2
             light = light / (1 + (x * x + y * y) / 600.0**2) ** 2
         filters = _mosaic(h, w) if self.colour else 1.0
-        electrons = rng.poisson(np.maximum(light * gain * filters, 0) * ELECTRONS)
-        raw = np.clip(electrons / ELECTRONS + READ * rng.standard_normal((h, w)) + offset, 0, 255)
+        per_level, read = ELECTRONS / self.iso_gain, READ * self.iso_gain
+        electrons = rng.poisson(np.maximum(light * gain * filters, 0) * per_level)
+        raw = np.clip(electrons / per_level + read * rng.standard_normal((h, w)) + offset, 0, 255)
         planes = _interpolate(np.rint(raw * 16) / 16) if self.colour else raw[..., None]
         levels = np.clip(np.rint(255 * curve(self.tone, np.clip(planes, 0, 255) / 255)), 0, 255)
         return _encode(levels.astype(np.uint8), self.jpeg)
