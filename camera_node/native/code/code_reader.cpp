@@ -26,7 +26,7 @@ constexpr double kChanged = 1e-3;           // and that a track has become anoth
 constexpr double kModelError = 0.1;         // of a sector's level, contrasts
 constexpr double kRemembered = 10;          // frames of a mean: errors of fits differ from frame to frame
 constexpr float kImpossible = -1e9f;        // a log-likelihood
-constexpr int kMaxEdges = 12;               // of a word between ink and paper
+constexpr int kMaxEdges = 12;               // between ink and paper, of any of the words
 constexpr double kInterpolation = 1 / 6.0;  // variance that bilinear interpolation adds to blur, px^2
 
 /// Directions counter-clockwise as seen in front of the print: those of the sectors' starts, and turns by

@@ -50,14 +50,16 @@ double in_flat_patches(const ImageView& image, const Measure& measure) {
 /// The variance of the sums of the 16 squares of a patch, for each of their 16 pixels.
 double density_of(const ImageView& patch) {
     double sum = 0, squared = 0;
-    for (int y = 0; y < 4 * kSquare; y += kSquare)
-        for (int x = 0; x < 4 * kSquare; x += kSquare) {
-            int levels = 0;
-            for (int v = y; v < y + kSquare; ++v)
-                levels = std::accumulate(patch.row(v) + x, patch.row(v) + x + kSquare, levels);
+    for (int y = 0; y < 4 * kSquare; y += kSquare) {
+        uint16_t columns[4 * kSquare] = {};
+        for (int v = y; v < y + kSquare; ++v)
+            for (int x = 0; x < 4 * kSquare; ++x) columns[x] = uint16_t(columns[x] + patch.row(v)[x]);
+        for (const uint16_t* x = columns; x < std::end(columns); x += kSquare) {
+            const double levels = std::accumulate(x, x + kSquare, 0);
             sum += levels;
-            squared += double(levels) * levels;
+            squared += levels * levels;
         }
+    }
     return (squared - sum * sum / 16) / (15 * 16);
 }
 

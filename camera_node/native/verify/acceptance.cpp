@@ -199,16 +199,16 @@ static bool has_black_ink(const RoundelFit& fit) {
 static double ring_energy(const ImageView& image, const RoundelFit& fit) {
     const Ellipse& e = fit.outer;
     const double a = e.major / 2, b = e.minor / 2, c = std::cos(e.angle), s = std::sin(e.angle);
-    const double reach = kMinCard * a;
+    const double ax = c / a, ay = s / a, bx = -s / b, by = c / b, reach = kMinCard * a;
     const int step = std::max(1, int(a * b / kEnergyPixels));
     double n[2]{}, sum[2]{};
     for (int v = std::max(0, int(e.y - reach)); v <= std::min(image.height - 1, int(e.y + reach)); ++v)
         for (int u = std::max(0, int(e.x - reach)) + v % step;
              u <= std::min(image.width - 1, int(e.x + reach)); u += step) {
             const double x = u - e.x, y = v - e.y;
-            const double f = std::hypot((c * x + s * y) / a, (c * y - s * x) / b);
-            if (f > kMinCard) continue;
-            const bool ink = f > fit.ratio && f < 1;
+            const double squared = square(ax * x + ay * y) + square(bx * x + by * y);
+            if (squared > square(kMinCard)) continue;
+            const bool ink = squared > square(fit.ratio) && squared < 1;
             n[ink] += step;
             sum[ink] += step * double(image.row(v)[u]);
         }
