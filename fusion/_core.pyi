@@ -198,23 +198,29 @@ def predict(
     densities (N, 2) and single (N,): see `fusion.model.states.predict`.
     """
 
-def eliminate_bodies(
+def eliminate_robots(
     equations: Array,
     weights: Array,
     body: Index,
     camera: Index,
+    marker: Index,
+    robot: Index,
+    owner: Index,
     information: Array,
     right: Array,
+    of_places: Array,
+    right_of_places: Array,
     n_cameras: int,
     damping: float,
     /,
-) -> tuple[Array, Array]:
-    """(8 C, 8 C + 1) normal equations of C cameras with their right side, B bodies eliminated (Schur complement).
+) -> tuple[Array, Array, Array]:
+    """(8 C, 8 C + 1) normal equations of C cameras with their right side, robots eliminated (Schur complement).
 
-    Also (B, 12, 8 C + 1): the inverse of each body's block times its border and its right side. Equations
-    (N, 2, 12 + 8 + 1): derivatives by body and camera, and residuals; weights, body and camera (N,); information and
-    right side (B, 12) of the bodies beside the observations; `damping` is the share by which their diagonals grow.
-    Raises RuntimeError where a body is not determined.
+    Also (B, 12, 8 C + 1) and (M, 3, 8 C + 1): the errors of the B bodies and of the places of the M markers are the
+    last column less the others times the errors of the cameras. Equations (N, 2, 12 + 8 + 3 + 1): derivatives by body,
+    camera and place, and residuals; weights, body, camera and marker (N,); robot (B,) of each body and owner (M,) of
+    each marker, in ascending order; information and right sides (B, 12) and (M, 3) beside the observations; `damping`
+    is the share by which their diagonals grow. Raises RuntimeError where a body or a marker is not determined.
     """
 
 def respond(

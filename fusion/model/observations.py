@@ -377,6 +377,10 @@ class MarkerTable(Columns):
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         )
 
+    def place(self, rows: Index, position: Array) -> None:
+        """The markers `rows` are at other places (K, 3) on their robots."""
+        self.position[:, rows] = position.T
+
     def discs(self, rows: Index, frame: Index) -> Discs:
         """The markers `rows`, each in one frame."""
         of = self.select(rows)

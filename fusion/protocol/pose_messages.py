@@ -26,6 +26,15 @@ Vector = tuple[float, float, float]
 MAX_NUMBER = 1e5  # of a coordinate or velocity, in metres, m/s or rad/s
 QUATERNION_SLACK = 1e-3  # of the length of a rotation's quaternion
 TrackingState = Literal["tracked", "coasting", "lost"]
+# What rounding the entries of a correlation matrix (12, 12) to <f4 may take from its smallest eigenvalue.
+ROUNDED = 12 * 2.0**-24
+
+
+def covariance_bytes(P: Array) -> bytes:
+    """Covariances (..., 12, 12) as <f4, with variances that grow by `ROUNDED` before rounding and as much after it, so
+    that the matrices stay positive definite: claims of metres along one line and tenths of millimetres across it need
+    more digits than <f4 has."""
+    return (P + (2 * ROUNDED) * (P * np.eye(12))).astype("<f4").tobytes()
 
 
 class Latency(msgspec.Struct, frozen=True, kw_only=True):
@@ -128,7 +137,7 @@ class RobotPose(msgspec.Struct, frozen=True, kw_only=True):
             t_ns=t_ns,
             position=tuple(predicted.p[0].tolist()),
             quaternion_wxyz=tuple(wxyz_from_rotation(predicted.R[0]).tolist()),
-            covariance=P.astype("<f4").tobytes(),
+            covariance=covariance_bytes(P),
             evidence_age_s=None if self.evidence_age_s is None else max(self.evidence_age_s + dt, 0.0),
         )
 

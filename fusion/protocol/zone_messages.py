@@ -11,7 +11,7 @@ from camera_node.foundation.config import is_name
 from camera_node.geometry.pose import rotation_from_wxyz, wxyz_from_rotation
 from camera_node.protocol.messages import VERSION, MessageError
 from fusion.model.states import States
-from fusion.protocol.pose_messages import MAX_NUMBER, QUATERNION_SLACK
+from fusion.protocol.pose_messages import MAX_NUMBER, QUATERNION_SLACK, covariance_bytes
 
 MAX_EPOCH = 1 << 62  # so that its successor is an integer of 64 bits, too
 
@@ -71,7 +71,7 @@ class ZoneStates(msgspec.Struct, frozen=True, kw_only=True):
             t_ns=t_ns,
             robots=tuple(names[k] for k in rows.tolist()),
             motion=motion.astype("<f8").tobytes(),
-            covariance=selected.P.astype("<f4").tobytes(),
+            covariance=covariance_bytes(selected.P),
         )
 
     def check(self) -> None:

@@ -27,12 +27,12 @@ from fusion.model.states import OMEGA, POSITION, VELOCITY, States
 
 # The errors of a camera by their columns (`calib.rig.camera_errors`).
 CAUSES: dict["Cause", slice] = {"pose": slice(0, 6), "clock": slice(6, 7), "focal": slice(7, 8)}
-Cause = Literal["pose", "clock", "focal", "wand"]
+Cause = Literal["pose", "clock", "focal", "wand", "shape"]
 # Standard deviations of errors that a hypothesis frees: weak, they only keep the system regular. Arrivals show larger
 # jumps of a clock.
 FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [0.1, 0.1])
 WAND_SIGMA = 0.05  # of the rig's size, if the lengths of the wand are wrong
-SHAPE_M = 1e-3  # of a marker's position in robots.yaml, measured by hand
+SHAPE_M, FREE_SHAPE_M = 3e-4, 0.02  # of a marker's place that was measured or drawn, and if that is wrong
 POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
 RIVAL = 1e-3  # likelihood of another explanation, relative to the accepted one
@@ -61,6 +61,8 @@ class Window:
         moving: (B,) whether that is more than noise. The others show no clock: if noise is their velocity, a clock that
             is off by a second explains anything.
         single: (B,) bodies with one marker.
+        robot: (B,) of each body.
+        markers, owner: (M,) rows of the marker table, and the robots that have them, in ascending order.
         observations: N detections of all keyframes with their discs.
         by_focal: (2, N) derivatives of the undistorted detections by the logarithm of the focal length.
         keyframe: (B,) of each body.
@@ -74,6 +76,9 @@ class Window:
     velocity_sigma: Array
     moving: Mask
     single: Mask
+    robot: Index
+    markers: Index
+    owner: Index
     observations: MatchedObservations
     by_focal: Array
     keyframe: Index
@@ -82,6 +87,11 @@ class Window:
     def camera(self) -> Index:
         """(N,) of each observation."""
         return self.observations.detections.camera
+
+    @property
+    def marker(self) -> Index:
+        """(N,) of each observation, of the M markers."""
+        return np.searchsorted(self.markers, self.observations.discs.marker)
 
     @property
     def growth(self) -> Array:
@@ -106,6 +116,7 @@ class Window:
             velocity_sigma=self.velocity_sigma[bodies],
             moving=self.moving[bodies],
             single=self.single[bodies],
+            robot=self.robot[bodies],
             observations=replace(seen, discs=discs),
             by_focal=np.ascontiguousarray(self.by_focal[:, kept]),
             keyframe=self.keyframe[bodies],
@@ -117,7 +128,7 @@ class Hypothesis:
     """The errors (C, 8) that are free, and where the search for them begins (C, 8); `cameras` are those at fault.
 
     The standard deviations of all other errors are `scale` times those of the calibration. If `has_other_size`, the
-    size of the whole rig is free as well.
+    size of the whole rig is free as well, and the places of the markers of `robots`.
     """
 
     cause: Cause | None
@@ -126,6 +137,7 @@ class Hypothesis:
     start: Array
     scale: float = 1.0
     has_other_size: bool = False
+    robots: tuple[int, ...] = ()
 
     @classmethod
     def of(
@@ -145,12 +157,14 @@ class Hypothesis:
     def is_part_of(self, other: "Hypothesis") -> bool:
         """Whether the other one frees all that this one does."""
         is_free = (self.free <= other.free).all() and self.has_other_size <= other.has_other_size
-        return bool(is_free) and self.scale in (1.0, other.scale)
+        return bool(is_free) and self.scale in (1.0, other.scale) and set(self.robots) <= set(other.robots)
 
-    @property
-    def n_free(self) -> int:
+    def n_free(self, window: Window) -> int:
         """The number of free parameters."""
-        return int(self.free.sum()) + self.has_other_size
+        n_places = 3 * int(
+            np.isin(window.owner, self.robots).sum()
+        )  # of which a pose of each robot is not determined
+        return int(self.free.sum()) + self.has_other_size + n_places - CAUSES["pose"].stop * len(self.robots)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,10 +176,12 @@ class Fit:
         penalty: of the free parameters (Bayesian information criterion), and of the errors that a scale allows.
         errors: (C, 8) of the cameras, to be applied to `Window.T` by `retract`.
         bodies: (B, 12) errors of the bodies, to be applied to `Window.states`.
+        places: (M, 3) errors of the places of markers on their robots, metres (body frame).
         prior: (8 C, 8 C) information about the errors by the calibration, where they are not free.
-        reduced: (8 C, 8 C + 1) normal equations of the errors by the observations, robots eliminated.
-        rows: (N, 2, 12 + 8 + 1) whitened derivatives of the observations by the errors of their bodies and cameras, and
-            residuals.
+        reduced: (8 C, 8 C + 1) normal equations of the errors by the observations, robots and the places of their
+            markers eliminated.
+        rows: (N, 2, 12 + 8 + 3 + 1) whitened derivatives of the observations by the errors of their bodies, cameras and
+            places, and residuals.
         squared: (N,) squared whitened residuals; NaN where the disc is not visible.
     """
 
@@ -174,6 +190,7 @@ class Fit:
     penalty: float
     errors: Array
     bodies: Array
+    places: Array
     prior: Array
     reduced: Array
     rows: Array
@@ -182,52 +199,23 @@ class Fit:
     @property
     def by_camera(self) -> Array:
         """(N, 2, 8) whitened derivatives of the observations by the errors of their cameras."""
-        return self.rows[:, :, 12:-1]
+        return self.rows[:, :, 12 : 12 + ERRORS]
 
     @property
     def equations(self) -> tuple[Array, Array]:
         """Least squares H e = y, (8 C, 8 C) and (8 C,), about the errors by the observations alone."""
-        return self._about_errors(self.reduced)
-
-    def _about_errors(self, reduced: Array) -> tuple[Array, Array]:
-        H, g = reduced[:, :-1], reduced[:, -1]
+        H, g = self.reduced[:, :-1], self.reduced[:, -1]
         return H / self.variance, (g + H @ self.errors.ravel()) / self.variance
-
-    def equations_of_unknown_shapes(self, window: Window) -> tuple[Array, Array]:
-        """The same, if each marker may be `SHAPE_M` off its place on its robot, in all keyframes the same: bodies and
-        then markers are eliminated."""
-        discs, C = window.observations.discs, ERRORS * len(window.names)
-        marker = np.unique(discs.marker, return_inverse=True)[1]
-        shapes = slice(C, C + 3 * (int(marker.max(initial=-1)) + 1))
-        k, R = np.arange(len(marker))[:, None], window.states.retract(self.bodies).R[discs.body]
-        columns = np.zeros((len(marker), 2, shapes.stop + 1))  # of cameras and markers, and residuals
-        columns[k, :, ERRORS * window.camera[:, None] + np.arange(ERRORS)] = self.by_camera.transpose(0, 2, 1)
-        columns[k, :, C + 3 * marker[:, None] + np.arange(3)] = (self.rows[:, :, POSITION] @ R).transpose(
-            0, 2, 1
-        )
-        columns[:, :, -1] = self.rows[:, :, -1]
-        weights, priors = 1 / (1 + np.nan_to_num(self.squared) / _core.CAUCHY**2), _body_prior(window)
-        H = np.einsum("n,nai,naj->ij", weights, columns, columns, optimize=True)
-        for b, prior in enumerate(priors):
-            mine = discs.body == b
-            J, rest = self.rows[mine, :, :12].reshape(-1, 12), columns[mine].reshape(-1, columns.shape[2])
-            weighted = J.T * np.repeat(weights[mine], 2)
-            cross = weighted @ rest
-            cross[:, -1] -= prior * self.bodies[b]
-            H -= cross.T @ np.linalg.solve(weighted @ J + np.diag(prior), cross)
-        known = H[shapes, shapes] + np.eye(shapes.stop - C) / SHAPE_M**2
-        H -= H[:, shapes] @ np.linalg.solve(known, H[shapes])
-        return self._about_errors(np.delete(H[:C], shapes, axis=1))
 
     @property
     def variance(self) -> float:
         """Of a whitened residual, by the median, not below 1."""
         return max(1.0, self._median())
 
-    def noise(self) -> float:
+    def noise(self, window: Window) -> float:
         """Variance of a whitened residual, with the parameters counted that took their share of the observations; not
         below 1, infinite if nothing is left."""
-        determined = CAUSES["pose"].stop * len(self.bodies) + self.hypothesis.n_free
+        determined = CAUSES["pose"].stop * len(self.bodies) + self.hypothesis.n_free(window)
         left = 1 - determined / (2 * max(1, int(np.isfinite(self.squared).sum())))
         return max(1.0, self._median() / left) if left > 0 else np.inf
 
@@ -307,6 +295,7 @@ class Verdict:
         fit: of the best hypothesis.
         misfit: mean squared residual without a fault in units of its expectation, not below 1.
         scale: of the errors that the calibration states, if no single camera is at fault: the most likely one.
+        size: logarithm of how much larger the arena may be than the rig.
     """
 
     cause: Cause | None
@@ -314,6 +303,12 @@ class Verdict:
     fit: Fit
     misfit: float = 1.0
     scale: float = 1.0
+    size: float = 0.0
+
+    @property
+    def is_of_size(self) -> bool:
+        """Whether the rig has another size than the robots; which of them is wrong, one robot does not show."""
+        return self.cause == "wand" or (self.fit.hypothesis.cause == "shape" and self.size != 0.0)
 
     @property
     def is_of_rig(self) -> bool:
@@ -341,9 +336,11 @@ def judge(window: Window, starts: Array, moved: Sequence[int] = ()) -> Verdict:
     none = fit(window, Hypothesis.of(None, (), n))
     if not is_contradicted(none, n, 1.0):
         return Verdict(None, (), none, scale=_most_likely_scale(window, none))
-    everything = fit(window, Hypothesis.of(None, range(n), n, starts))
+    everything = fit(
+        window, replace(Hypothesis.of(None, range(n), n, starts), robots=several_markers(window))
+    )
     scale = _most_likely_scale(window, everything)
-    if not is_contradicted(none, n, everything.noise()):
+    if not is_contradicted(none, n, everything.noise(window)):
         return Verdict(None, (), none, scale=scale)
     if not everything.is_adequate():  # nor is any other hypothesis
         return Verdict(None, tuple(range(n)), everything, none.misfit, scale)
@@ -358,10 +355,27 @@ def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Seq
     fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in seeing]
     other_size = replace(as_stated[0].hypothesis, cause="wand", has_other_size=True)
     fits += [fit(window, Hypothesis.of("focal", seeing, n)), fit(window, other_size)]
+    all_shapes = fit(window, replace(as_stated[0].hypothesis, cause="shape", robots=several_markers(window)))
+    suspected = _displaced_most(window, all_shapes)
+    fits += [all_shapes, *(fit(window, replace(all_shapes.hypothesis, robots=(r,))) for r in suspected)]
     if len(seeing) > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
-    return decide([*as_stated, *fits], seeing)
+    verdict = decide([*as_stated, *fits], seeing)
+    best, rivals = _explanations([*as_stated, *fits], seeing)
+    sizes = [f.growth(window) for f in (best, *rivals) if f.hypothesis.has_other_size]
+    return replace(verdict, size=sizes[0] if sizes else 0.0)
+
+
+def several_markers(window: Window) -> tuple[int, ...]:
+    """The robots with several markers: the place of a lone one is that of its robot."""
+    return tuple(np.unique(window.robot[~window.single]).tolist())
+
+
+def _displaced_most(window: Window, shapes: Fit) -> list[int]:
+    """The robots whose markers a fit places farthest from their places."""
+    squared = np.bincount(window.owner, np.sum(shapes.places**2, axis=1))
+    return sorted(several_markers(window), key=lambda r: -squared[r])[:MAX_SUSPECTS]
 
 
 def _most_likely_scale(window: Window, best: Fit) -> float:
@@ -415,6 +429,17 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
     explains no more. One camera at fault is more probable than larger errors of all, by `RIVAL`;
     only cameras that can be found at fault refute these.
     """
+    best, rivals = _explanations(fits, seeing)
+    cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
+    is_of_few = cause == "focal" or 2 * len(cameras) < len(seeing)
+    if not rivals and (is_of_few or cameras == tuple(moved)):
+        return Verdict(cause, cameras, best)
+    named = {k for f in (best, *rivals) for k in f.hypothesis.cameras}
+    return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best)
+
+
+def _explanations(fits: Sequence[Fit], seeing: Sequence[int]) -> tuple[Fit, list[Fit]]:
+    """The best hypothesis, and those that explain about as much."""
     variance = min(f.variance for f in fits)
     score = {id(f): f.cost / variance + f.penalty + f.hypothesis.odds for f in fits}
     best = min(fits, key=lambda f: score[id(f)])
@@ -427,12 +452,7 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
         and score[id(f)] < limit
         and (not best.hypothesis.odds or 2 * len(f.hypothesis.cameras) < len(seeing))
     ]
-    cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
-    is_of_few = cause == "focal" or 2 * len(cameras) < len(seeing)
-    if not rivals and (is_of_few or cameras == tuple(moved)):
-        return Verdict(cause, cameras, best)
-    named = {k for f in (best, *rivals) for k in f.hypothesis.cameras}
-    return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best)
+    return best, rivals
 
 
 def _suspects(poses: Sequence[Fit]) -> list[int]:
@@ -442,12 +462,13 @@ def _suspects(poses: Sequence[Fit]) -> list[int]:
 
 def fit(window: Window, hypothesis: Hypothesis) -> Fit:
     """Fit cameras and robots from the start of the hypothesis, by Levenberg-Marquardt with Cauchy weights."""
-    prior = _prior(window, hypothesis)
-    at = _evaluate(window, hypothesis, prior, hypothesis.start, np.zeros((len(window.states), 12)))
+    priors = _Priors.of(window, hypothesis)
+    bodies, places = np.zeros((len(window.states), 12)), np.zeros((len(window.markers), 3))
+    at = _evaluate(window, priors, hypothesis.start, bodies, places)
     damping = FIRST_DAMPING
     for _ in range(MAX_ITERATIONS):
-        by_camera, by_body = _step(window, hypothesis, at, damping)
-        tried = _evaluate(window, hypothesis, prior, at.errors + by_camera, at.bodies + by_body)
+        by_camera, by_body, by_place = _step(window, priors, at, damping)
+        tried = _evaluate(window, priors, at.errors + by_camera, at.bodies + by_body, at.places + by_place)
         if tried.cost >= at.cost:
             damping *= 10
             continue
@@ -455,55 +476,66 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
         at, damping = tried, damping / 10
         if is_converged:
             break
-    reduced, _ = _eliminate(window, at, 0.0)
-    penalty = float(hypothesis.n_free * np.log(2 * len(at.squared)))
+    reduced, *_ = _eliminate(window, priors, at, 0.0)
+    penalty = float(hypothesis.n_free(window) * np.log(2 * len(at.squared)))
     if hypothesis.scale != 1.0:
         stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
         penalty += np.log(2 * len(at.squared)) + larger - stated
-    found = at.errors, at.bodies, at.prior
+    found = at.errors, at.bodies, at.places, priors.cameras
     return Fit(hypothesis, at.cost, penalty, *found, reduced, at.rows, at.squared)
 
 
-def _prior(window: Window, hypothesis: Hypothesis) -> Array:
-    """(8 C, 8 C) information about the errors, without that about the free ones."""
-    held = ~hypothesis.free.ravel()
-    covariance = window.covariance(hypothesis.scale) * np.outer(held, held)
-    covariance += np.diag((hypothesis.free * FREE_SIGMA**2).ravel())
-    if hypothesis.has_other_size:
-        covariance += WAND_SIGMA**2 * np.outer(window.growth, window.growth)
-    return np.asarray(np.linalg.inv(covariance), float)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Priors:
+    """Information about the errors of cameras (8 C, 8 C), bodies (B, 12) and places of markers (M, 3)."""
 
+    cameras: Array
+    bodies: Array
+    places: Array
 
-def _body_prior(window: Window) -> Array:
-    """(B, 12) information about the errors of the bodies."""
-    rotation, position = POSE_SIGMA
-    weak = np.tile([rotation**-2.0] * 3 + [position**-2.0] * 3 + [0.0] * 6, (len(window.states), 1))
-    weak[:, OMEGA] = (window.velocity_sigma[:, 0] ** -2)[:, None]
-    weak[:, VELOCITY] = (window.velocity_sigma[:, 1] ** -2)[:, None]
-    return weak
+    @classmethod
+    def of(cls, window: Window, hypothesis: Hypothesis) -> "_Priors":
+        """Without that about the errors that are free."""
+        held = ~hypothesis.free.ravel()
+        covariance = window.covariance(hypothesis.scale) * np.outer(held, held)
+        covariance += np.diag((hypothesis.free * FREE_SIGMA**2).ravel())
+        if hypothesis.has_other_size:
+            covariance += WAND_SIGMA**2 * np.outer(window.growth, window.growth)
+        rotation, position = POSE_SIGMA
+        bodies = np.tile([rotation**-2.0] * 3 + [position**-2.0] * 3 + [0.0] * 6, (len(window.states), 1))
+        bodies[:, OMEGA] = (window.velocity_sigma[:, 0] ** -2)[:, None]
+        bodies[:, VELOCITY] = (window.velocity_sigma[:, 1] ** -2)[:, None]
+        place_m = np.where(np.isin(window.owner, hypothesis.robots), FREE_SHAPE_M, SHAPE_M)
+        return cls(
+            np.asarray(np.linalg.inv(covariance), float), bodies, np.repeat(place_m[:, None] ** -2, 3, axis=1)
+        )
+
+    def cost(self, errors: Array, bodies: Array, places: Array) -> float:
+        """The sum of squares of errors in their standard deviations."""
+        of_robots = np.sum(bodies**2 * self.bodies) + np.sum(places**2 * self.places)
+        return float(errors.ravel() @ self.cameras @ errors.ravel() + of_robots)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Point:
-    """A point of the search: errors of cameras (C, 8) and bodies (B, 12), and the equations there.
+    """A point of the search: errors of cameras (C, 8), bodies (B, 12) and places (M, 3), and the equations there.
 
     Attributes:
-        prior: (8 C, 8 C) information about the errors of the cameras.
-        rows: (N, 2, 12 + 8 + 1) derivatives by body and camera, and residuals.
+        rows: (N, 2, 12 + 8 + 3 + 1) derivatives by body, camera and place, and residuals.
         squared: (N,) squared residuals; NaN where the disc is not visible.
         cost: robust sum of squares, with the priors.
     """
 
     errors: Array
     bodies: Array
-    prior: Array
+    places: Array
     rows: Array
     squared: Array
     cost: float
 
 
-def _evaluate(window: Window, hypothesis: Hypothesis, prior: Array, errors: Array, bodies: Array) -> _Point:
-    """Linearize at a point; `prior` (8 C, 8 C) is the information of the hypothesis."""
+def _evaluate(window: Window, priors: _Priors, errors: Array, bodies: Array, places: Array) -> _Point:
+    """Linearize at a point."""
     states, seen = window.states.retract(bodies), window.observations.detections
     T, camera, discs = retract(window.T, errors), seen.exposures.camera, window.observations.discs
     R, centres = T[camera, :3, :3].transpose(0, 2, 1), T[camera, :3, 3]
@@ -514,33 +546,39 @@ def _evaluate(window: Window, hypothesis: Hypothesis, prior: Array, errors: Arra
         np.concatenate([tau + errors[camera, 6], tau]),
         np.zeros(2 * len(camera)),
     )
-    columns = replace(discs, frame=discs.frame + len(camera) * ~shows_clock).columns
+    displaced = replace(
+        discs,
+        frame=discs.frame + len(camera) * ~shows_clock,
+        position=discs.position + places[window.marker].T,
+    )
     poses, whiten = _core.FramePoses(states.bodies, exposures), window.observations.whiten
-    by_body = poses.linearize_centres(columns, seen.xy, whiten, window.single)
-    by_camera = poses.differentiate_by_camera(columns, whiten, window.by_focal)
+    by_body = poses.linearize_centres(displaced.columns, seen.xy, whiten, window.single)
+    by_camera = poses.differentiate_by_camera(displaced.columns, whiten, window.by_focal)
     by_camera[:, :, 6] *= shows_clock[:, None]
+    by_place = by_body[:, :, POSITION] @ states.R[discs.body]
     visible = (by_camera != 0).any((1, 2))
     r = by_body[:, :, 12] - by_camera[:, :, 7] * errors[window.camera, 7, None]
     squared = np.where(visible, np.sum(r**2, 1), np.nan)
     capped = np.nan_to_num(squared, nan=BEHIND)
-    cost = _core.CAUCHY**2 * np.log1p(capped / _core.CAUCHY**2).sum()
-    cost += errors.ravel() @ prior @ errors.ravel() + np.sum(bodies**2 * _body_prior(window))
-    rows = np.concatenate([by_body[:, :, :12], by_camera, r[:, :, None]], 2)
-    return _Point(errors, bodies, prior, rows, squared, float(cost))
+    cost = float(_core.CAUCHY**2 * np.log1p(capped / _core.CAUCHY**2).sum())
+    rows = np.concatenate([by_body[:, :, :12], by_camera, by_place, r[:, :, None]], 2)
+    return _Point(errors, bodies, places, rows, squared, cost + priors.cost(errors, bodies, places))
 
 
-def _eliminate(window: Window, at: _Point, damping: float) -> tuple[Array, Array]:
-    """See `_core.eliminate_bodies`."""
+def _eliminate(window: Window, priors: _Priors, at: _Point, damping: float) -> tuple[Array, Array, Array]:
+    """See `_core.eliminate_robots`."""
     weights = 1 / (1 + np.nan_to_num(at.squared) / _core.CAUCHY**2)
-    prior, n = _body_prior(window), len(window.names)
-    body, camera = window.observations.discs.body, window.camera
-    return _core.eliminate_bodies(at.rows, weights, body, camera, prior, -prior * at.bodies, n, damping)
+    of_rows = window.observations.discs.body, window.camera, window.marker
+    of_robots = priors.bodies, -priors.bodies * at.bodies, priors.places, -priors.places * at.places
+    rest = window.robot, window.owner, *of_robots, len(window.names), damping
+    return _core.eliminate_robots(at.rows, weights, *of_rows, *rest)
 
 
-def _step(window: Window, hypothesis: Hypothesis, at: _Point, damping: float) -> tuple[Array, Array]:
-    """Steps (C, 8) of the cameras and (B, 12) of the bodies."""
-    reduced, by_body = _eliminate(window, at, damping)
-    H = reduced[:, :-1] + at.prior
+def _step(window: Window, priors: _Priors, at: _Point, damping: float) -> tuple[Array, Array, Array]:
+    """Steps (C, 8) of the cameras, (B, 12) of the bodies and (M, 3) of the places."""
+    reduced, by_body, by_place = _eliminate(window, priors, at, damping)
+    H = reduced[:, :-1] + priors.cameras
     H[np.diag_indices(len(H))] += damping * np.abs(np.diag(reduced))
-    step = np.asarray(np.linalg.solve(H, reduced[:, -1] - at.prior @ at.errors.ravel()), float)
-    return step.reshape(-1, ERRORS), by_body[:, :, -1] - by_body[:, :, :-1] @ step
+    step = np.asarray(np.linalg.solve(H, reduced[:, -1] - priors.cameras @ at.errors.ravel()), float)
+    of_bodies, of_places = (by[:, :, -1] - by[:, :, :-1] @ step for by in (by_body, by_place))
+    return step.reshape(-1, ERRORS), of_bodies, of_places

@@ -333,6 +333,7 @@ def _assemble(
     states = keyframes[0].states.joined(*(keyframe.states for keyframe in keyframes[1:]))
     sigma = velocity_sigma(keyframes, robots)
     single = np.bincount(markers.robot)[robots] == 1
+    of_window = np.flatnonzero(np.isin(markers.robot, robots))
     return Window(
         names=cameras.names,
         T=np.array([cameras[name].matrix() for name in cameras.names]),
@@ -342,6 +343,9 @@ def _assemble(
         velocity_sigma=sigma,
         moving=is_significant(states.omega, sigma[:, 0]) | is_significant(states.v, sigma[:, 1]),
         single=single,
+        robot=robots,
+        markers=of_window,
+        owner=markers.robot[of_window],
         observations=observations,
         by_focal=np.ascontiguousarray(by_focal[:, :, 0].T),
         keyframe=np.repeat(np.arange(len(keyframes)), [len(keyframe.robots) for keyframe in keyframes]),

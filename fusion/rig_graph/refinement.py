@@ -37,7 +37,6 @@ from fusion.rig_graph.hypotheses import (
     LARGE,
     MIN_FOR_PAIRS,
     RIVAL,
-    SHAPE_M,
     retract,
 )
 from fusion.rig_graph.keyframes import GATES_PX
@@ -63,8 +62,7 @@ class Refinement:
         self.cameras, given = cameras, list(cameras.values())
         self._metrics = image_metrics(given)
         self._stated, self._since, self._scale = error_covariance(given), np.diag(since), 1.0
-        self._own, self._shape_px = _own_covariance(given, self._metrics), _in_image(given, SHAPE_M)
-        self._own_px = np.full(len(given), USUAL_PX)  # in the image, of the last window
+        self._own = _own_covariance(given, self._metrics)
         self.x, self.P = np.zeros(len(since)), self._prior
         self._t_ns = self._n_refused = 0
         self._freed = set[int]()  # cameras that changed, and are not corrected yet
@@ -90,13 +88,11 @@ class Refinement:
         self.P[np.ix_(rows, rows)] += (GATES_PX[-1] / USUAL_PX) ** 2 * self._own[np.ix_(rows, rows)]
         self._freed.add(k)
 
-    def update(self, t_ns: int, H: Array, y: Array, n_markers: int) -> None:
-        """Add keyframes of `n_markers` markers: least squares H e = y, (8 C, 8 C) and (8 C,), about the errors at their
-        mean time."""
+    def update(self, t_ns: int, H: Array, y: Array) -> None:
+        """Add keyframes: least squares H e = y, (8 C, 8 C) and (8 C,), about the errors at their mean time."""
         self._wander(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
         self._t_ns, identity = t_ns, np.eye(len(y))
-        self._own_px = np.hypot(USUAL_PX, self._shape_px / n_markers**0.5)
-        with_own = np.linalg.inv(identity + H @ self._own_now)
+        with_own = np.linalg.inv(identity + H @ self._own)
         H, y = with_own @ H, with_own @ y
         if not self._agrees(H, y - H @ self.x):
             self._n_refused += 1
@@ -108,11 +104,6 @@ class Refinement:
         P = np.linalg.solve(identity + self.P @ H, self.P)
         self.P = (P + P.T) / 2
         self.x = self.x + self.P @ off
-
-    @property
-    def _own_now(self) -> Array:
-        """(8 C, 8 C) covariance of the errors that the last window has of its own."""
-        return self._own * np.repeat((self._own_px / USUAL_PX) ** 2, ERRORS)
 
     def _wander(self, dt: float) -> None:
         """An Ornstein-Uhlenbeck process about the rig in use."""
@@ -158,7 +149,7 @@ class Refinement:
     def is_significant(self) -> bool:
         """Whether a camera is off by more than the rig states and windows have of their own, and none so far that its
         markers were mistaken; of a camera that changed, by more than is uncertain yet."""
-        off_px, least = self.off_px, LARGE * np.maximum(self._image_px(self._stated), self._own_px)
+        off_px, least = self.off_px, LARGE * np.maximum(self._image_px(self._stated), USUAL_PX)
         freed = sorted(self._freed)
         is_known = (off_px > LARGE * self._image_px(self.P))[freed].all()
         return bool((off_px > least).any() and (off_px < GATES_PX[-1]).all() and is_known)
@@ -173,7 +164,7 @@ class Refinement:
         errors[[name in pinned for name in self.cameras]] = 0.0
         errors[np.sqrt(self._metrics[:, 7, 7]) * np.abs(errors[:, 7]) < USUAL_PX, 7] = 0.0
         self.x = self.x - errors.ravel()
-        joint, clocks = self.P + self._own_now + np.outer(self.x, self.x), ~np.tile(OF_IMAGE, len(errors))
+        joint, clocks = self.P + self._own + np.outer(self.x, self.x), ~np.tile(OF_IMAGE, len(errors))
         joint[clocks], joint[:, clocks] = self._stated[clocks], self._stated[:, clocks]
         self._stated, self._scale = joint, 1.0
         self._freed.clear()
@@ -204,11 +195,6 @@ def _gain(score: Array, information: Array, rows: Index, sigma: Array) -> float:
     """
     A, b = np.eye(len(rows)) + sigma[:, None] * information[np.ix_(rows, rows)] * sigma, sigma * score[rows]
     return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
-
-
-def _in_image(cameras: Sequence[Camera], length_m: float) -> Array:
-    """(C,) a length at the working ranges of cameras, pixels."""
-    return length_m * np.array([(c.fx * c.fy) ** 0.5 for c in cameras]) / working_ranges(cameras)
 
 
 def _own_covariance(cameras: Sequence[Camera], metrics: Array) -> Array:

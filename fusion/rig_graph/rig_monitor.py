@@ -49,13 +49,16 @@ from fusion.rig_graph.hypotheses import (
     fit,
     judge,
     retract,
+    several_markers,
 )
 from fusion.rig_graph.keyframes import GATES_PX, N_MEAN, Keyframe, Keyframes, Moments, window_of
 from fusion.rig_graph.refinement import Refinement
+from fusion.rig_graph.robot_shapes import RobotShapes, displacements
 
 log = logging.getLogger("fusion")
 T = TypeVar("T")
-Measured = tuple[int, Array, Array]  # Unix time in ns, and H (8 C, 8 C) and y (8 C,) of `ClockWalk.update`
+Equations = tuple[int, Array, Array]  # Unix time in ns, and H (8 C, 8 C) and y (8 C,) of `ClockWalk.update`
+Measured = tuple[Equations, dict[int, Array]]  # and `displacements`
 Judgement = tuple[Window, Verdict, Measured | None]
 NICENESS = 10  # of the process that judges: poses and detections come first
 # Keyframes that are judged: the more, the better they determine a camera; the fewer, the sooner all of them are new.
@@ -89,7 +92,7 @@ class RigMonitor:
         excluded: names of moved cameras whose poses are not known yet.
         pinned: names of cameras whose poses a user confirmed; these do not change.
         contradicting: names of the cameras of which some are at fault, but the data do not decide which.
-        refines: whether poses and lenses are corrected by what robots show of them.
+        refines: whether poses, lenses and the places of markers are corrected by what robots show of them.
         is_settled: whether the last `check` judged what contradicts the predictions: no clock is searched for.
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
     """
@@ -103,6 +106,8 @@ class RigMonitor:
         self._is_contradicted = False
         self._walk = ClockWalk(len(cameras.names))
         self._departures: tuple[Departure, ...] = ()
+        self._shapes = RobotShapes(markers)
+        self._has_placed = False
         self._given_ns = self._measured_ns = 0  # of the last keyframes of the last job, and of the walk
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._refinement: Refinement | None = None  # of the cameras in use; None before their first window
@@ -176,6 +181,23 @@ class RigMonitor:
         for departure in found:
             self._keyframes.retime(self._cameras.names[departure.camera], departure.at)
         return found
+
+    def take_placed(self) -> bool:
+        """Whether markers are used at other places on their robots since the last call."""
+        has_placed, self._has_placed = self._has_placed, False
+        return has_placed
+
+    def _note_shapes(self, verdict: Verdict, measured: Measured | None) -> None:
+        """Use the markers of robots where several windows show them, if no camera may be at fault: the robots were
+        measured wrong."""
+        best = verdict.fit.hypothesis
+        is_of_robots = best.cause in (None, "shape") and not best.cameras and not verdict.size
+        if measured is None or not self.refines or self.excluded or not is_of_robots:
+            return
+        self._measured_ns = self._given_ns
+        if self._shapes.add(measured[1]):
+            self._has_placed = True
+            self._forget()
 
     def jump(self, name: str, sigma_s: float, rate_sigma: float) -> None:
         """The stamps of a camera jumped, or may have; see `ClockWalk.jump`."""
@@ -271,6 +293,7 @@ class RigMonitor:
         names = self._blamed(window, verdict)
         self.is_settled = verdict.cause != "clock"
         self._note_clocks(verdict, measured)
+        self._note_shapes(verdict, measured)
         is_known = verdict.cause in ("pose", "clock")  # what is corrected
         is_open = verdict.is_of_rig or (bool(names) and not is_known)
         self._n_undecided = self._n_undecided + 1 if is_open else 0
@@ -282,7 +305,7 @@ class RigMonitor:
             self._scale_claims(window, verdict, names)
         if names:
             self._size_m = _claim_m(window) * verdict.misfit**0.5
-        self._is_of_wand = verdict.cause == "wand"
+        self._is_of_wand = verdict.is_of_size
         self._note_undecided(names if self._n_undecided >= CONFIRMED else self._underrated())
         if not self._is_contradicted:
             return self._returned(window)
@@ -300,7 +323,7 @@ class RigMonitor:
     def _refine(self, window: Window, verdict: Verdict, measured: Measured | None) -> RigRefinement | None:
         """Add a window that contradicts no pose to what is known of all errors; the rig with other poses and lenses if
         they are larger than it states."""
-        is_explained = verdict.cause == "focal" or (verdict.cause is None and not verdict.cameras)
+        is_explained = verdict.cause in ("focal", "shape") or (verdict.cause is None and not verdict.cameras)
         is_accepted = self._scale > 1.0 or not verdict.is_of_rig
         if measured is None or self.excluded or not (is_explained and is_accepted):
             return None
@@ -310,7 +333,7 @@ class RigMonitor:
         if verdict.cause == "focal":
             for k in verdict.cameras:
                 refinement.free_lens(k)
-        refinement.update(*measured, len(np.unique(window.observations.discs.marker)))
+        refinement.update(*measured[0])
         self._measured_ns = self._given_ns
         if not refinement.is_significant:
             return None
@@ -326,8 +349,10 @@ class RigMonitor:
         size than the robots."""
         if verdict.cause is None and len(verdict.cameras) == 1 and len(_seeing(window)) <= MIN_FOR_PAIRS:
             return tuple(_seeing(window))
-        if verdict.cause == "wand":
+        if verdict.is_of_size:
             return window.names
+        if verdict.fit.hypothesis.cause == "shape":  # which is corrected once several windows agree on it
+            return ()
         if verdict.cause is None and verdict.fit.hypothesis.scale != 1.0 and not self._states_errors():
             return ()
         return tuple(window.names[k] for k in verdict.cameras)
@@ -340,9 +365,7 @@ class RigMonitor:
         self._scale, claimed = scales
         if self._scale == claimed:
             self._doubted.clear()
-        size_error = (
-            abs(verdict.fit.growth(window)) if verdict.cause == "wand" else self._cameras.size_error * fall
-        )
+        size_error = abs(verdict.size) or self._cameras.size_error * fall
         self._cameras.count_errors(claimed, size_error)
 
     def _states_errors(self) -> bool:
@@ -379,7 +402,7 @@ class RigMonitor:
         if measured is None:
             return
         self._measured_ns = self._given_ns
-        if self._walk.update(*measured):
+        if self._walk.update(*measured[0]):
             self._departures = self._walk.take_departures()
 
     def _note_undecided(self, names: tuple[str, ...]) -> None:
@@ -594,7 +617,9 @@ def _measure(
     shown = window.select(is_new)
     if not len(shown.camera):
         return None
-    return int(times[is_new].mean()), *fit(shown, verdict.fit.hypothesis).equations_of_unknown_shapes(shown)
+    found = fit(shown, replace(verdict.fit.hypothesis, robots=several_markers(shown)))
+    equations = int(times[is_new].mean()), *found.equations
+    return equations, displacements(shown, found)
 
 
 def _seeing(window: Window) -> list[str]:

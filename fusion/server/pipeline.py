@@ -268,5 +268,5 @@ class TrackingPipeline:
             clocks=tracker.monitors.clocks.health(),
             measured_diameters_m=tracker.sizes.misfits(),
             not_acquired=tracker.not_acquired(),
-            contradictions=tracker.monitors.rig.contradictions() or tracker.claims.contradictions(),
+            contradictions=tracker.contradictions(),
         )

@@ -14,7 +14,7 @@ from camera_node.geometry.pose import wxyz_from_rotation
 from fusion.model.frames import FrameSet
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
 from fusion.model.states import States
-from fusion.protocol.pose_messages import Latency, Markers, RobotPose
+from fusion.protocol.pose_messages import Latency, Markers, RobotPose, covariance_bytes
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.named_markers import read_codes
 from fusion.tracking.rays import Marker
@@ -139,7 +139,7 @@ def robot_poses(
     states, names, status = table.states, cameras.names, table.status
     p, v, omega = _tuples(states.p), _tuples(states.v), _tuples(states.omega)
     wxyz, residual = _tuples(wxyz_from_rotation(states.R)), summary.residual_px.tolist()
-    P, markers = table.claimed.astype("<f4").tobytes(), summary.n_markers.tolist()
+    P, markers = covariance_bytes(table.claimed), summary.n_markers.tolist()
     owned, coded, seen_by, age_s = (
         table.owned.tolist(),
         table.coded.tolist(),

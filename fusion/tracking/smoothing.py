@@ -18,6 +18,7 @@ import numpy as np
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.pose import vector_from_rotation, wxyz_from_rotation
 from fusion.model.states import OMEGA, POSITION, THETA, VELOCITY, States
+from fusion.protocol.pose_messages import covariance_bytes
 from fusion.tracking.estimator import Prediction
 from fusion.tracking.result import TrackingResult
 
@@ -70,7 +71,7 @@ class Smoother:
                 quaternion_wxyz=tuple(wxyz[k].tolist()),
                 velocity=tuple(states.v[k].tolist()),
                 angular_velocity=tuple(states.omega[k].tolist()),
-                covariance=P[k].astype("<f4").tobytes(),
+                covariance=covariance_bytes(P[k]),
             )
             for pose in result.poses
             for k in (self._row[pose.robot],)

@@ -93,7 +93,18 @@ class TrackTable:
             self.states = self.states.with_rows(np.array([row]), old.states.select(np.array([k])))
             self.status[row], self._seen_ns[row] = old.status[k], old._seen_ns[k]
             self._seen[row], same[row] = old._seen[k], k
+            self.markers.place(
+                np.flatnonzero(self.markers.robot == row),
+                old.markers.position[:, old.markers.robot == k].T,
+            )
         return same
+
+    def displaced_m(self) -> dict[str, float]:
+        """By name of each robot whose markers are used at other places than declared, the largest distance."""
+        declared = np.concatenate([np.zeros((0, 3)), *(robot.points for robot in self.robots)])
+        off_m = np.zeros(len(self.robots))
+        np.maximum.at(off_m, self.markers.robot, np.linalg.norm(self.markers.position.T - declared, axis=1))
+        return {self.names[k]: float(off_m[k]) for k in np.flatnonzero(off_m).tolist()}
 
     def interval_s(self, t_ns: int) -> float:
         """The prediction interval from the last frame set to `t_ns`."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Tracks robots and unlabeled markers from frame set to frame set, live and offline. Reads no clock."""
 
+import logging
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,7 +17,9 @@ from fusion.model.robots import Robot
 from fusion.model.states import Snapshot
 from fusion.monitoring.camera_monitors import CameraMonitors
 from fusion.monitoring.size_check import SizeCheck
-from fusion.protocol.pose_messages import RobotPose
+from fusion.protocol.arena_health import describe_contradiction
+from fusion.protocol.pose_messages import Contradiction, RobotPose
+from fusion.rig_graph.hypotheses import SHAPE_M
 from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import AssignedFrames, AssociatedFrames, Association, OwnDetections
 from fusion.tracking.claim_check import ClaimCheck
@@ -36,6 +39,7 @@ from fusion.tracking.single_view import SingleViewTracker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
 
+log = logging.getLogger("fusion")
 WORTH = 3  # frames that cost as much as their association, which is repeated for each late one
 PAUSED = "no robot is acquired while the wand is recorded"
 
@@ -104,6 +108,7 @@ class Tracker:
         self.sizes = SizeCheck(self.table.names, diameters, self.cameras, self.table.markers)
         self.acquires_none = False
         self._reasons: dict[int, str] = {}
+        self._displaced: set[str] = set()  # robots whose markers are elsewhere, and were logged
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None while its camera is withheld, or if that time is in the future."""
@@ -186,7 +191,7 @@ class Tracker:
         )
         if self.monitors.rig.is_settled and is_doubtful:
             self.robust.settle()
-        if corrections:
+        if corrections or self.monitors.rig.take_placed():
             self.claims.forget()
         return corrections
 
@@ -209,6 +214,21 @@ class Tracker:
         other.rig_response.inherit(self.rig_response, other.table.inherit(self.table, renamed))
         other.table.claimed = other.rig_response.claimed(other.table.states.P)
         return other
+
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """The cameras and the robots that contradict what the rig and robots.yaml state of them; each robot is logged
+        when it first appears."""
+        displaced = tuple(
+            Contradiction(
+                kind="robot", names=(name,), error_over_claim=(off_m / SHAPE_M) ** 2, size_mm=1e3 * off_m
+            )
+            for name, off_m in self.table.displaced_m().items()
+        )
+        for contradiction in displaced:
+            if contradiction.names[0] not in self._displaced:
+                log.warning(describe_contradiction(contradiction))
+        self._displaced = {c.names[0] for c in displaced}
+        return (*(self.monitors.rig.contradictions() or self.claims.contradictions()), *displaced)
 
     def not_acquired(self) -> dict[str, str]:
         """Why the robots that are neither tracked nor coasting were not acquired, by name."""

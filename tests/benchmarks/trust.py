@@ -196,6 +196,20 @@ def marker(mm: float) -> Kind:
     return make
 
 
+def markers(sigma_mm: float) -> Kind:
+    """All markers of all robots are off the places that `robots.yaml` states, as if measured by hand."""
+
+    def make(load: Load, rng: np.random.Generator) -> Setting:
+        robots = {}
+        for name, robot in load.bodies.items():
+            off = 1e-3 * sigma_mm * rng.standard_normal((len(robot.markers), 3)) * (1.0, 1.0, 0.0)
+            moved = tuple(tuple((place + o).tolist()) for place, o in zip(robot.points, off, strict=True))
+            robots[name] = msgspec.structs.replace(robot, markers=moved)
+        return Setting(Rig(cameras=load.rig), robots, guilty=frozenset(robots), in_files=True)
+
+    return make
+
+
 def exchanged(load: Load, rng: np.random.Generator) -> Setting:
     """Two cameras have each other's names."""
     a, b = (str(name) for name in rng.choice(list(load.rig), 2, replace=False))
@@ -221,7 +235,8 @@ KINDS: dict[str, Kind] = {
     "clocks of 1/2 +40 ms": clocks(40.0, 0.5),
     "clocks of 3/4 +40 ms": clocks(40.0, 0.75),
     "wand 1 % short": wand(1.0),
-    "marker 10 mm off": marker(10.0),
+    **{f"marker {mm:g} mm off": marker(mm) for mm in (5.0, 10.0, 20.0)},
+    **{f"all markers {mm:g} mm off": markers(mm) for mm in (0.3, 1.0)},
     "names exchanged": exchanged,
 }
 FROM_THE_START = ("turned", "shifted", "bar", "focal")  # kinds that are also tried so

@@ -40,27 +40,40 @@ Out log_ratios(const In<double, -1, 2, 12>& A, const In<double, -1, 2>& nu, cons
     return ratios;
 }
 
-auto eliminate_bodies(const In<double, -1, 2, 21>& equations, const Numbers& weights, const Index& body,
-                      const Index& camera, const In<double, -1, 12>& information,
-                      const In<double, -1, 12>& right, size_t n_cameras, double damping) {
-    const size_t n = weights.size(), n_bodies = information.shape(0);
-    require_equal(n, {equations.shape(0), body.size(), camera.size()});
-    require_equal(n_bodies, {right.shape(0)});
+auto eliminate_robots(const In<double, -1, 2, 24>& equations, const Numbers& weights, const Index& body,
+                      const Index& camera, const Index& marker, const Index& robot, const Index& owner,
+                      const In<double, -1, 12>& information, const In<double, -1, 12>& right,
+                      const In<double, -1, 3>& of_places, const In<double, -1, 3>& right_of_places,
+                      size_t n_cameras, double damping) {
+    const size_t n = weights.size(), n_bodies = information.shape(0), n_markers = owner.size();
+    require_equal(n, {equations.shape(0), body.size(), camera.size(), marker.size()});
+    require_equal(n_bodies, {right.shape(0), robot.size()});
+    require_equal(n_markers, {of_places.shape(0), right_of_places.shape(0)});
+    const auto n_robots = n_markers ? size_t(owner(n_markers - 1)) + 1 : 0;
     const JointSystem system{reinterpret_cast<const JointEquations*>(equations.data()),
                              weights.data(),
                              below(n_bodies, body),
                              below(n_cameras, camera),
+                             below(n_markers, marker),
+                             below(n_robots, robot),
+                             owner.data(),
                              n,
                              n_bodies,
-                             n_cameras};
-    const BodyPriors priors{reinterpret_cast<const ErrorVector*>(information.data()),
-                            reinterpret_cast<const ErrorVector*>(right.data()), damping};
+                             n_cameras,
+                             n_markers};
+    using Place = std::array<double, kPlaceErrors>;
+    const RobotPriors priors{reinterpret_cast<const ErrorVector*>(information.data()),
+                             reinterpret_cast<const ErrorVector*>(right.data()),
+                             reinterpret_cast<const Place*>(of_places.data()),
+                             reinterpret_cast<const Place*>(right_of_places.data()), damping};
     const size_t d = kCameraErrors * n_cameras;
     auto [reduced, to_reduced] = make({d, d + 1});
     auto [by_body, to_body] = make({n_bodies, kErrors, d + 1});
-    unlocked(
-        [&, to_reduced = to_reduced, to_body = to_body] { eliminate(system, priors, to_reduced, to_body); });
-    return std::make_tuple(reduced, by_body);
+    auto [by_marker, to_marker] = make({n_markers, kPlaceErrors, d + 1});
+    std::fill_n(to_marker, by_marker.size(), 0.0);
+    const Eliminated to{to_reduced, to_body, to_marker};
+    unlocked([&] { eliminate(system, priors, to); });
+    return std::make_tuple(reduced, by_body, by_marker);
 }
 
 auto predict_bodies(const BodyStates& bodies, const Covariances& P, const Numbers& dt,
@@ -89,7 +102,7 @@ void bind_equations(nb::module_& m) {
     m.attr("NOMINAL_WEIGHT") = kNominalWeight;
     m.def("predict", &predict_bodies);
     m.def("log_ratios", &log_ratios);
-    m.def("eliminate_bodies", &eliminate_bodies);
+    m.def("eliminate_robots", &eliminate_robots);
     m.def("inverses", &inverses);
 }
 

@@ -2,20 +2,18 @@
 """Derivatives by the errors of cameras, the elimination of robots, and which hypothesis is accepted."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
 
 from fusion import _core
-from fusion.rig_graph import hypotheses
 from fusion.rig_graph.hypotheses import (
     CAUSES,
     ERRORS,
     Hypothesis,
-    Window,
     decide,
-    fit,
     is_contradicted,
     retract,
 )
@@ -83,28 +81,49 @@ def test_derivatives_by_the_pose_are_those_of_gtsam_for_a_point():
         np.testing.assert_allclose(found[k, :, :6], jacobian[:, :6], rtol=1e-9, atol=1e-9)
 
 
+BODIES, CAMERAS_SEEING, OWNER, ROBOT = 6, 3, np.array([0, 0, 0, 2, 2]), np.array([0, 2, 0, 2, 2, 0])
+
+
+def system() -> tuple[np.ndarray, ...]:
+    """300 equations of the markers of two robots with their weights, bodies, cameras and markers."""
+    rng, n = np.random.default_rng(5), 300
+    body = rng.integers(0, BODIES, n)
+    marker = np.where(ROBOT[body] == 0, rng.integers(0, 3, n), rng.integers(3, 5, n))
+    D = rng.normal(size=(n, 2, 12 + ERRORS + 3 + 1))
+    return D, rng.uniform(0.1, 1, n), body, rng.integers(0, CAMERAS_SEEING, n), marker
+
+
 def test_elimination_gives_the_solution_of_the_whole_system():
-    rng = np.random.default_rng(5)
-    n, bodies, cameras = 300, 6, 3
-    D = rng.normal(size=(n, 2, 12 + ERRORS + 1))
-    weights, body, camera = rng.uniform(0.1, 1, n), rng.integers(0, bodies, n), rng.integers(0, cameras, n)
-    prior, right = rng.uniform(0.5, 2, (bodies, 12)), rng.normal(size=(bodies, 12))
-    size = 12 * bodies + ERRORS * cameras
-    A = np.zeros((n, 2, size))
+    D, weights, body, camera, marker = system()
+    rng, n, n_robots = np.random.default_rng(6), len(D), 12 * BODIES + 3 * len(OWNER)
+    priors = [rng.uniform(0.5, 2, (k, m)) for k, m in ((BODIES, 12), (len(OWNER), 3))]
+    rights = [rng.normal(size=prior.shape) for prior in priors]
+    A = np.zeros((n, 2, n_robots + ERRORS * CAMERAS_SEEING))
+    firsts = [12 * body, n_robots + ERRORS * camera, 12 * BODIES + 3 * marker]
     for k in range(n):
-        A[k, :, 12 * body[k] : 12 * body[k] + 12] = D[k, :, :12]
-        first = 12 * bodies + ERRORS * camera[k]
-        A[k, :, first : first + ERRORS] = D[k, :, 12:-1]
-    H = np.einsum("n,nai,naj->ij", weights, A, A)
-    H[range(12 * bodies), range(12 * bodies)] += prior.ravel()
-    g = np.einsum("n,nai,na->i", weights, A, D[:, :, -1])
-    g[: 12 * bodies] += right.ravel()
+        for first, columns in zip(firsts, np.split(D[k, :, :-1], [12, 12 + ERRORS], axis=1), strict=True):
+            A[k, :, first[k] : first[k] + columns.shape[1]] = columns
+    H, g = np.einsum("n,nai,naj->ij", weights, A, A), np.einsum("n,nai,na->i", weights, A, D[:, :, -1])
+    H[range(n_robots), range(n_robots)] += np.concatenate([prior.ravel() for prior in priors])
+    g[:n_robots] += np.concatenate([right.ravel() for right in rights])
     whole = np.linalg.solve(H, g)
-    reduced, by_body = _core.eliminate_bodies(D, weights, body, camera, prior, right, cameras, 0.0)
+    given = ROBOT, OWNER, priors[0], rights[0], priors[1], rights[1], CAMERAS_SEEING, 0.0
+    reduced, *by = _core.eliminate_robots(D, weights, body, camera, marker, *given)
     step = np.linalg.solve(reduced[:, :-1], reduced[:, -1])
-    np.testing.assert_allclose(step, whole[12 * bodies :], rtol=1e-8, atol=1e-10)
-    of_bodies = by_body[:, :, -1] - by_body[:, :, :-1] @ step
-    np.testing.assert_allclose(of_bodies.ravel(), whole[: 12 * bodies], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(step, whole[n_robots:], rtol=1e-8, atol=1e-10)
+    found = [(b[:, :, -1] - b[:, :, :-1] @ step).ravel() for b in by]
+    np.testing.assert_allclose(np.concatenate(found), whole[:n_robots], rtol=1e-8, atol=1e-10)
+
+
+def test_the_less_is_known_of_the_places_of_markers_the_less_cameras_are_shown():
+    found = []
+    for known in (1e9, 30.0, 1e-3):
+        bodies, places = np.ones((BODIES, 12)), np.full((len(OWNER), 3), known)
+        given = ROBOT, OWNER, bodies, 0 * bodies, places, 0 * places, CAMERAS_SEEING, 0.0
+        found.append(_core.eliminate_robots(*system(), *given)[0][:, :-1])
+    for more, less in pairwise(found):
+        assert np.linalg.eigvalsh(more - less).min() > -1e-6
+        assert np.linalg.eigvalsh(more - less).max() > 1.0
 
 
 @pytest.mark.parametrize(("sigmas", "contradicts"), [(0.0, False), (4.0, False), (13.0, True)])
@@ -160,37 +179,3 @@ def test_errors_of_a_cause_are_free_and_no_others():
         free = Hypothesis.of(cause, (1,), 3).free
         assert free[1, columns].all()
         assert free.sum() == len(range(*columns.indices(ERRORS)))
-
-
-def test_markers_that_may_be_off_their_places_show_less_of_the_cameras(monkeypatch: pytest.MonkeyPatch):
-    """Nothing more in any direction, and as much where the places are known."""
-    window = window_of_scene()
-    found = fit(window, Hypothesis.of(None, (), len(CAMERAS)))
-    (H, y), (unknown, _) = found.equations, found.equations_of_unknown_shapes(window)
-    scale = np.sqrt(np.diag(H)) + 1e-9
-    more = np.linalg.eigvalsh((unknown - H) / np.outer(scale, scale))
-    assert more.max() < 1e-9
-    assert more.min() < -0.01
-    monkeypatch.setattr(hypotheses, "SHAPE_M", 1e-9)
-    known, y_known = found.equations_of_unknown_shapes(window)
-    np.testing.assert_allclose(known / np.outer(scale, scale), H / np.outer(scale, scale), atol=1e-9)
-    np.testing.assert_allclose(y_known / scale, y / scale, atol=1e-9 * np.abs(y / scale).max())
-
-
-def window_of_scene() -> Window:
-    """The scene as a keyframe, its detections a pixel of noise off."""
-    states, seen = scene()
-    T, n = np.array([camera.matrix() for camera in CAMERAS.values()]), len(states)
-    return Window(
-        names=tuple(CAMERAS),
-        T=T,
-        prior=ARRAY.covariance,
-        since=np.full(ERRORS * len(CAMERAS), 1e-12),
-        states=states,
-        velocity_sigma=np.full((n, 2), 1e-3),
-        moving=np.ones(n, bool),
-        single=np.zeros(n, bool),
-        observations=seen,
-        by_focal=np.ascontiguousarray(seen.detections.xy),
-        keyframe=np.zeros(n, np.intp),
-    )

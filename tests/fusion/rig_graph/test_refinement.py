@@ -17,7 +17,6 @@ from fusion.rig_graph.refinement import Refinement
 from tests.fusion.synthetic import ring
 
 WINDOW_NS, START_NS = 600_000_000, 10**18
-MARKERS = 400  # so many that errors of their places don't matter
 NOISE_PX = 0.02  # of what a window shows of one error
 SINCE = np.array([1e-8] * 3 + [1e-8] * 3 + [OFFSET_SIGMA_S, FOCAL_STABILITY]) ** 2
 
@@ -43,7 +42,7 @@ class Windows:
     def show(self, refinement: Refinement, errors: np.ndarray, k: int) -> None:
         """Window k, of errors (8 C,)."""
         noise = self._root @ self._rng.normal(size=len(errors))
-        refinement.update(START_NS + k * WINDOW_NS, self._H, self._H @ errors + noise, MARKERS)
+        refinement.update(START_NS + k * WINDOW_NS, self._H, self._H @ errors + noise)
 
 
 def since(n: int) -> np.ndarray:
