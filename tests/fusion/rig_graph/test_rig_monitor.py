@@ -87,8 +87,8 @@ def test_a_misplaced_marker_is_found_and_no_camera_is_blamed(off_m, reported, ca
     found = tracker.contradictions()
     assert [(c.kind, c.names) for c in found] == ([("robot", ("a",))] if reported else [])
     assert ("robot a" in caplog.text) == reported
-    sides = [distances(points) for points in (tracker.table.markers.position.T, glued.points)]
-    np.testing.assert_allclose(*sides, atol=2 * DISPLACED_M)
+    used = distances(tracker.table.markers.position.T)
+    np.testing.assert_allclose(used, distances(glued.points), atol=2 * DISPLACED_M)
     again = tracker.with_robots({"a": TRIANGLE, "b": WIDE}, {})
     np.testing.assert_array_equal(again.table.markers.position[:, :3], tracker.table.markers.position)
 
