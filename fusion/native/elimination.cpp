@@ -97,7 +97,8 @@ std::vector<size_t> seen_columns(const JointSystem& system, const ByBody& of,
                                  const std::vector<size_t>& bodies, const Shared& shared, size_t end) {
     std::vector<char> is_seen(system.n_cameras);
     for (const size_t b : bodies)
-        for (size_t at = of.first[b]; at < of.first[b + 1]; ++at) is_seen[system.camera[of.indices[at]]] = true;
+        for (size_t at = of.first[b]; at < of.first[b + 1]; ++at)
+            is_seen[system.camera[of.indices[at]]] = true;
     std::vector<size_t> seen;
     for (size_t j = 0; j < shared.d; ++j)
         if (is_seen[j / kCameraErrors]) seen.push_back(j);

@@ -29,7 +29,7 @@ struct JointSystem {
 /// (Marquardt 1963).
 struct RobotPriors {
     const ErrorVector *information, *right;
-    const std::array<double, kPlaceErrors> *of_places, *right_of_places;
+    const std::array<double, kPlaceErrors>*of_places, *right_of_places;
     double damping;
 };
 
