@@ -84,7 +84,7 @@ def test_derivatives_by_the_pose_are_those_of_gtsam_for_a_point():
 BODIES, CAMERAS_SEEING, OWNER, ROBOT = 6, 3, np.array([0, 0, 0, 2, 2]), np.array([0, 2, 0, 2, 2, 0])
 
 
-def system() -> tuple[np.ndarray, ...]:
+def system() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """300 equations of the markers of two robots with their weights, bodies, cameras and markers."""
     rng, n = np.random.default_rng(5), 300
     body = rng.integers(0, BODIES, n)
