@@ -28,13 +28,13 @@ QUATERNION_SLACK = 1e-3  # of the length of a rotation's quaternion
 TrackingState = Literal["tracked", "coasting", "lost"]
 # What rounding the entries of a correlation matrix (12, 12) to <f4 may take from its smallest eigenvalue.
 ROUNDED = 12 * 2.0**-24
+ENLARGED = 1 + 2 * ROUNDED * np.eye(12)  # twice, because the variances are rounded, too
 
 
 def covariance_bytes(P: Array) -> bytes:
-    """Covariances (..., 12, 12) as <f4, with variances that grow by `ROUNDED` before rounding and as much after it, so
-    that the matrices stay positive definite: claims of metres along one line and tenths of millimetres across it need
-    more digits than <f4 has."""
-    return (P + (2 * ROUNDED) * (P * np.eye(12))).astype("<f4").tobytes()
+    """Covariances (..., 12, 12) as <f4, with variances enlarged so that they stay positive definite: claims of metres
+    along one line and tenths of millimetres across it need more digits than <f4 has."""
+    return (P * ENLARGED).astype("<f4").tobytes()
 
 
 class Latency(msgspec.Struct, frozen=True, kw_only=True):

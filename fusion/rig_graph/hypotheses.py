@@ -183,6 +183,7 @@ class Fit:
         rows: (N, 2, 12 + 8 + 3 + 1) whitened derivatives of the observations by the errors of their bodies, cameras and
             places, and residuals.
         squared: (N,) squared whitened residuals; NaN where the disc is not visible.
+        size: logarithm of how much larger the arena is than the rig, by the errors.
     """
 
     hypothesis: Hypothesis
@@ -195,6 +196,7 @@ class Fit:
     reduced: Array
     rows: Array
     squared: Array
+    size: float = 0.0
 
     @property
     def by_camera(self) -> Array:
@@ -229,10 +231,6 @@ class Fit:
         """Mean squared residual in units of its expectation, not below 1."""
         known = self.squared[np.isfinite(self.squared)]
         return max(1.0, float(known.mean()) / 2) if len(known) else 1.0
-
-    def growth(self, window: Window) -> float:
-        """The logarithm of how much larger the arena is than the rig, by the errors."""
-        return float(self.errors.ravel() @ window.growth / (window.growth @ window.growth))
 
     def is_adequate(self) -> bool:
         """Whether the residuals are noise of any variance: a wrong model leaves more large ones."""
@@ -361,10 +359,7 @@ def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Seq
     if len(seeing) > MIN_FOR_PAIRS:
         suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
         fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
-    verdict = decide([*as_stated, *fits], seeing)
-    best, rivals = _explanations([*as_stated, *fits], seeing)
-    sizes = [f.growth(window) for f in (best, *rivals) if f.hypothesis.has_other_size]
-    return replace(verdict, size=sizes[0] if sizes else 0.0)
+    return decide([*as_stated, *fits], seeing)
 
 
 def several_markers(window: Window) -> tuple[int, ...]:
@@ -429,17 +424,6 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
     explains no more. One camera at fault is more probable than larger errors of all, by `RIVAL`;
     only cameras that can be found at fault refute these.
     """
-    best, rivals = _explanations(fits, seeing)
-    cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
-    is_of_few = cause == "focal" or 2 * len(cameras) < len(seeing)
-    if not rivals and (is_of_few or cameras == tuple(moved)):
-        return Verdict(cause, cameras, best)
-    named = {k for f in (best, *rivals) for k in f.hypothesis.cameras}
-    return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best)
-
-
-def _explanations(fits: Sequence[Fit], seeing: Sequence[int]) -> tuple[Fit, list[Fit]]:
-    """The best hypothesis, and those that explain about as much."""
     variance = min(f.variance for f in fits)
     score = {id(f): f.cost / variance + f.penalty + f.hypothesis.odds for f in fits}
     best = min(fits, key=lambda f: score[id(f)])
@@ -452,7 +436,14 @@ def _explanations(fits: Sequence[Fit], seeing: Sequence[int]) -> tuple[Fit, list
         and score[id(f)] < limit
         and (not best.hypothesis.odds or 2 * len(f.hypothesis.cameras) < len(seeing))
     ]
-    return best, rivals
+    explanations = best, *rivals
+    size = next((f.size for f in explanations if f.hypothesis.has_other_size), 0.0)
+    cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
+    is_of_few = cause == "focal" or 2 * len(cameras) < len(seeing)
+    if not rivals and (is_of_few or cameras == tuple(moved)):
+        return Verdict(cause, cameras, best, size=size)
+    named = {k for f in explanations for k in f.hypothesis.cameras}
+    return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best, size=size)
 
 
 def _suspects(poses: Sequence[Fit]) -> list[int]:
@@ -482,7 +473,8 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
         stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
         penalty += np.log(2 * len(at.squared)) + larger - stated
     found = at.errors, at.bodies, at.places, priors.cameras
-    return Fit(hypothesis, at.cost, penalty, *found, reduced, at.rows, at.squared)
+    size = float(at.errors.ravel() @ window.growth / (window.growth @ window.growth))
+    return Fit(hypothesis, at.cost, penalty, *found, reduced, at.rows, at.squared, size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

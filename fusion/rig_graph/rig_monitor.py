@@ -187,18 +187,6 @@ class RigMonitor:
         has_placed, self._has_placed = self._has_placed, False
         return has_placed
 
-    def _note_shapes(self, verdict: Verdict, measured: Measured | None) -> None:
-        """Use the markers of robots where several windows show them, if no camera may be at fault: the robots were
-        measured wrong."""
-        best = verdict.fit.hypothesis
-        is_of_robots = best.cause in (None, "shape") and not best.cameras and not verdict.size
-        if measured is None or not self.refines or self.excluded or not is_of_robots:
-            return
-        self._measured_ns = self._given_ns
-        if self._shapes.add(measured[1]):
-            self._has_placed = True
-            self._forget()
-
     def jump(self, name: str, sigma_s: float, rate_sigma: float) -> None:
         """The stamps of a camera jumped, or may have; see `ClockWalk.jump`."""
         self._walk.jump(self._cameras.index[name], sigma_s, rate_sigma)
@@ -404,6 +392,18 @@ class RigMonitor:
         self._measured_ns = self._given_ns
         if self._walk.update(*measured[0]):
             self._departures = self._walk.take_departures()
+
+    def _note_shapes(self, verdict: Verdict, measured: Measured | None) -> None:
+        """Use the markers of robots where several windows show them, if no camera may be at fault: the robots were
+        measured wrong."""
+        best = verdict.fit.hypothesis
+        is_of_robots = best.cause in (None, "shape") and not best.cameras and not verdict.size
+        if measured is None or not self.refines or self.excluded or not is_of_robots:
+            return
+        self._measured_ns = self._given_ns
+        if self._shapes.add(measured[1]):
+            self._has_placed = True
+            self._forget()
 
     def _note_undecided(self, names: tuple[str, ...]) -> None:
         """Log cameras that contradict each other when that begins, and when it ends."""

@@ -12,12 +12,10 @@ from scipy.special import chdtri
 
 from camera_node.foundation.arrays import Array
 from fusion.model.observations import MarkerTable
-from fusion.rig_graph.hypotheses import FALSE_ALARM, SHAPE_M, Fit, Window
+from fusion.rig_graph.hypotheses import FALSE_ALARM, MAX_ITERATIONS, SHAPE_M, Fit, Window
 
 DISPLACED_M = 1e-3  # less is what lenses and a careful measurement by hand leave
 MIN_WINDOWS = 4  # for a variance: 3 for each coordinate of each marker
-NEGLIGIBLE_M = 1e-5  # noise of a displacement
-ITERATIONS = 20  # of reweighting
 
 
 @dataclass(slots=True)
@@ -38,7 +36,7 @@ class _Mean:
     @property
     def variance(self) -> float:
         """Of a coordinate of the mean."""
-        return (NEGLIGIBLE_M**2 + float(self.squares.mean()) / (self.n - 1)) / self.n
+        return float(self.squares.mean()) / (self.n - 1) / self.n
 
 
 class RobotShapes:
@@ -88,7 +86,7 @@ def in_own_frame(places: Array, off: Array) -> Array:
     starts = [_without(motions, off, 1.0 - np.eye(len(off))[k]) for k in range(len(off))]
     found = []
     for left in [off, *starts]:
-        for _ in range(ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             left = _without(motions, off, 1 / (1 + np.sum(left**2, axis=1) / SHAPE_M**2))
         found.append(left)
     return min(found, key=lambda left: np.log1p(np.sum(left**2, axis=1) / SHAPE_M**2).sum())
