@@ -194,7 +194,7 @@ def describe_server(state: ArenaState) -> str:
     if state.age_s(state.status) > STALE_S:
         return f"the server is silent for {state.age_s(state.status):.0f} s"
     return (
-        f"{status.frame_sets_per_s:.0f} poses/s, latency {_number(status.latency_ms, 1)} ms, "
+        f"{status.frame_sets_per_s:.0f} frame sets/s, latency {_number(status.latency_ms, 1)} ms, "
         f"processor {100 * status.cpu:.0f} %, {status.memory_mb:.0f} MB"
     )
 
@@ -249,7 +249,7 @@ def describe_arena(state: ArenaState) -> str:
 
 
 def _number(value: float | None, digits: int) -> str:
-    return NO_VALUE if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
+    return NO_VALUE if value is None or not np.isfinite(value) else f"{value:z.{digits}f}"
 
 
 def _bracketed_note(row: TableRow) -> str:

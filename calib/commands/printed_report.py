@@ -54,7 +54,7 @@ def camera_table(result: WandCalibration, quality: RigQuality) -> Table:
         counts = (f"{row.frames_used}/{row.frames}", str(row.outliers))
         error_mm = row.sigma_mm if report.metric else row.sigma_mm / 10
         figures = (f"{row.residual_px:.3f}", f"{error_mm:.2f}", f"{1 - camera.figures['unused']:.0%}")
-        clock = f"{result.time_offset_ms[k]:+.2f} ± {result.time_sigma_ms[k]:.2f}"
+        clock = f"{result.time_offset_ms[k]:+z.2f} ± {result.time_sigma_ms[k]:.2f}"
         table.add_row(row.name, camera.grade, *counts, *figures, *[clock] * clocks)
     return table
 

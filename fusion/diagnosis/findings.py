@@ -251,7 +251,7 @@ def _check_clock(name: str, camera: CameraStatus) -> Finding:
         return Finding(
             "error", subject, "no answer from the server's clock", "check the network of that machine"
         )
-    state = f"offset {camera.clock_offset_ms:.2f} ms, known within {camera.clock_error_ms:.2f} ms"
+    state = f"offset {camera.clock_offset_ms:z.2f} ms, known within {camera.clock_error_ms:.2f} ms"
     if camera.clock_error_ms > MAX_CLOCK_ERROR_MS:
         return Finding("warning", subject, state, "the network is slow or busy: use a cable")
     return Finding("ok", subject, state)

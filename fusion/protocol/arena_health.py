@@ -42,7 +42,7 @@ class ArenaHealth(msgspec.Struct, frozen=True, kw_only=True):
         parts = [
             f"{sum(self.cameras.values())} of {len(self.cameras)} cameras",
             f"{tracked} of {len(self.robots)} robots tracked",
-            f"{self.poses_per_s:.0f} poses/s",
+            f"{self.poses_per_s:.0f} frame sets/s",
             f"{self.faults} faults since the start",
             describe_calibration(self.calibration),
         ]
@@ -202,7 +202,7 @@ def describe_status(status: FusionStatus) -> str:
     declared = len({*status.robots, *status.not_acquired})
     return (
         f"{live} of {len(status.cameras)} cameras, {tracked} of {declared} robots tracked, "
-        f"{status.frame_sets_per_s:.0f} poses/s, {sum(status.faults.values())} faults"
+        f"{status.frame_sets_per_s:.0f} frame sets/s, {sum(status.faults.values())} faults"
     )
 
 

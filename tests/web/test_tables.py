@@ -140,7 +140,7 @@ def test_an_absent_server_is_offline(arena: LiveArena, feed: Feed):
     token = arena.session.liveliness().declare_token(arena.keys.fusion_alive)
     arena.status()
     wait_for(lambda: feed.state().status and feed.state().server_alive)
-    assert describe_server(feed.state()).startswith("30 poses/s, latency 7.7 ms")
+    assert describe_server(feed.state()).startswith("30 frame sets/s, latency 7.7 ms")
     token.undeclare()
     wait_for(lambda: not feed.state().server_alive)
     assert describe_server(feed.state()) == "the server is offline"

@@ -115,7 +115,7 @@ def test_a_browser_shows_the_arena(arena: LiveArena, view: View, page: Page):
         for text in ("Roundel: test at tcp/127.0.0.1:1", "north", "30.0"):
             page.get_by_text(text).first.wait_for()
         for tab, text in (
-            ("Status", "30 poses/s, latency 7.7 ms"),
+            ("Status", "30 frame sets/s, latency 7.7 ms"),
             ("Robots", "coasting"),
             ("Robots", "rover"),
         ):
