@@ -318,29 +318,32 @@ def epipolar_misfits(xy_a: Array, xy_b: Array) -> Array:
         xy_b: (S, n, 2) in camera b; NaN without a correspondence. A trial with too few has an infinite misfit.
     """
     known = np.isfinite(xy_b[..., 0])
-    b = np.where(known[..., None], xy_b, 0.0)
+    misfits, enough = np.full(len(known), np.inf), known.sum(axis=1) >= MIN_COMMON
+    if not enough.any():
+        return misfits
+    b = np.where(known[:, None], np.swapaxes(xy_b, 1, 2), 0.0)
     scale_a, scale_b = np.abs(xy_a).mean() + 1e-9, np.abs(b).mean() + 1e-9
-    one = np.ones((*known.shape, 1))
-    ha = np.concatenate([np.broadcast_to(xy_a / scale_a, b.shape), one], axis=2)
-    hb = np.concatenate([b / scale_b, one], axis=2)
-    products = (hb[..., :, None] * ha[..., None, :]).reshape(*known.shape, 9)
-    weight, median = known.astype(float), np.full(len(known), np.inf)
+    b, known = b[enough], known[enough]
+    ha = np.vstack([xy_a.T / scale_a, np.ones(len(xy_a))])
+    hb = np.concatenate([b / scale_b, np.ones((len(b), 1, b.shape[2]))], axis=1)
+    products = (hb[:, :, None] * ha).reshape(len(b), 9, -1)  # images along the last axis: three times as fast
+    weight, median = known.astype(float), misfits
     for _ in range(REWEIGHTINGS):
-        moments = np.swapaxes(products * weight[..., None], 1, 2) @ products
+        moments = (products * weight[:, None]) @ np.swapaxes(products, 1, 2)
         F = np.linalg.eigh(moments)[1][:, :, 0].reshape(-1, 3, 3)
-        off = np.abs(np.einsum("snk,sk->sn", products, F.reshape(-1, 9)))
-        lines_b, lines_a = ha @ np.swapaxes(F, 1, 2), hb @ F
-        slope = (lines_b[..., :2] / scale_b) ** 2, (lines_a[..., :2] / scale_a) ** 2
-        distance = off / np.sqrt(slope[0].sum(axis=2) + slope[1].sum(axis=2) + 1e-18)
+        off = np.abs(F.reshape(-1, 1, 9) @ products)[:, 0]
+        slope_b, slope_a = F[:, :2] @ ha / scale_b, np.swapaxes(F, 1, 2)[:, :2] @ hb / scale_a
+        distance = off / np.sqrt((slope_b**2).sum(axis=1) + (slope_a**2).sum(axis=1) + 1e-18)
         median = _masked_median(distance, known)
         weight = known / (1 + (distance / (2 * median[:, None] + 1e-9)) ** 2)
-    return np.where(known.sum(axis=1) >= MIN_COMMON, median, np.inf)
+    misfits[enough] = median
+    return misfits
 
 
 def _masked_median(values: Array, known: Mask) -> Array:
     ordered = np.sort(np.where(known, values, np.inf), axis=1)
-    middle = np.maximum(known.sum(axis=1) - 1, 0) // 2
-    return np.nan_to_num(ordered[np.arange(len(ordered)), middle], posinf=1.0)
+    middle = (known.sum(axis=1) - 1) // 2
+    return ordered[np.arange(len(ordered)), middle]
 
 
 @dataclass(frozen=True, slots=True)

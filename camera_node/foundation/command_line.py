@@ -3,11 +3,11 @@
 
 Each program lists its commands as `Command` records in its folder `commands`; `roundel` joins the lists. A command's
 module is imported when it runs: a camera's computer has neither GTSAM nor Viser, and lists of commands appear at once.
-tyro reads the options; a mistake in them is one line instead of its box.
+tyro reads the options; a mistake in them is one line instead of its box. What only mistakes need is imported where they
+are reported: every command begins with this module.
 """
 
 import contextlib
-import difflib
 import functools
 import inspect
 import io
@@ -17,7 +17,6 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import requires
 from typing import Any
 
 # Before NumPy is loaded: threads of a BLAS wait for each other longer than the products of small matrices take.
@@ -25,7 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import tyro
 
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, most_similar
 from camera_node.foundation.logs import set_up_logging
 
 EDGE = re.compile(r"^[│╭╰]\s?|\s*[│╮╯]$", re.MULTILINE)  # of the boxes that tyro prints
@@ -133,8 +132,8 @@ def find_command(commands: Sequence[Command], arguments: Sequence[str], remedy: 
     known = {command.name: command for command in commands}
     if arguments[0] in known:
         return known[arguments[0]]
-    similar = difflib.get_close_matches(arguments[0], known, 1)
-    hint = f"did you mean {similar[0]}?" if similar else f"the commands are {', '.join(known)}"
+    similar = most_similar(arguments[0], known)
+    hint = f"did you mean {similar}?" if similar else f"the commands are {', '.join(known)}"
     raise ConfigError(f"there is no command '{arguments[0]}'; {hint} ({remedy})")
 
 
@@ -152,6 +151,8 @@ def list_commands(commands: Sequence[Command], prog: str, about: str, examples: 
 
 def _extra_of(package: str) -> str | None:
     """The extra that installs a package; None if none does."""
+    from importlib.metadata import requires
+
     for requirement in requires("roundel") or ():
         name, extra = re.match(r"[\w-]+", requirement), re.search(r"extra == ['\"](\w+)", requirement)
         if name and extra and name[0] == package:
@@ -248,8 +249,8 @@ def _unknown(arguments: Sequence[str], known: set[str]) -> str:
     given = [word.split("=")[0].replace("_", "-") for word in arguments if re.match("--[A-Za-z]", word)]
     for option in given:
         if option not in known:
-            similar = difflib.get_close_matches(option, known, 1)
-            return f"there is no option {option}" + (f"; did you mean {similar[0]}?" if similar else "")
+            similar = most_similar(option, known)
+            return f"there is no option {option}" + (f"; did you mean {similar}?" if similar else "")
     return ""
 
 

@@ -6,7 +6,6 @@ A file is read in bounded time and memory: PyYAML and libyaml recurse, and expan
 
 import contextlib
 import csv
-import difflib
 import os
 import re
 import shutil
@@ -21,7 +20,7 @@ import msgspec
 import numpy as np
 import yaml
 
-from camera_node.foundation.errors import ConfigError, printable, unwritable
+from camera_node.foundation.errors import ConfigError, most_similar, printable, unwritable
 
 T = TypeVar("T")
 NAME = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
@@ -129,8 +128,8 @@ def _suggest(kind: type, fault: str) -> str:
     known = _fields(msgspec.inspect.type_info(kind), (match[2] or "").split(".")[1:]) if match else []
     if not match or not known:
         return ""
-    similar = difflib.get_close_matches(match[1], known, 1)
-    return f"; did you mean `{similar[0]}`?" if similar else f"; known fields: {', '.join(known)}"
+    similar = most_similar(match[1], known)
+    return f"; did you mean `{similar}`?" if similar else f"; known fields: {', '.join(known)}"
 
 
 def _fields(info: msgspec.inspect.Type, steps: list[str]) -> list[str]:

@@ -17,6 +17,7 @@ The exit code tells a service manager whether to retry: 2 stays until a user act
 """
 
 import errno
+from collections.abc import Iterable
 from pathlib import Path
 from typing import ClassVar
 
@@ -62,6 +63,13 @@ def printable(text: object, limit: int = MAX_LINE) -> str:
     shown = str(text)[: limit + 1]
     escaped = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
     return escaped if len(escaped) <= limit else escaped[:limit] + "..."
+
+
+def most_similar(word: str, known: Iterable[str]) -> str:
+    """That of the known words which was probably meant; empty if none is similar."""
+    from difflib import get_close_matches  # only mistakes need it, and every program imports this module
+
+    return next(iter(get_close_matches(word, known, 1)), "")
 
 
 def describe_failed_write(error: OSError) -> str:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Prints the output of all programs: results on stdout, progress on stderr.
 
-Lines are wrapped only on a terminal, so that output in a pipe does not depend on a width.
+Lines are wrapped only on a terminal, so that output in a pipe does not depend on a width. Progress bars are imported
+where one is shown: every program begins with this module.
 """
 
 import sys
@@ -10,8 +11,6 @@ from contextlib import contextmanager
 from typing import IO, TypeVar
 
 from rich.console import Console
-from rich.progress import Progress
-from rich.progress import track as _track
 
 T = TypeVar("T")
 UNLIMITED = 10_000  # columns, where the output is not a terminal
@@ -34,12 +33,16 @@ def say(text: str, on: Console | None = None) -> None:
 
 def track(steps: Iterable[T], description: str, total: float | None = None) -> Iterable[T]:
     """Yield the steps and show a progress bar, which disappears at the end."""
-    return _track(steps, description, total, console=progress_console(), transient=True)
+    from rich.progress import track as track_steps
+
+    return track_steps(steps, description, total, console=progress_console(), transient=True)
 
 
 @contextmanager
 def progress_bar(description: str) -> Iterator[Callable[[float], None]]:
     """A progress bar that disappears at the end; yields a function that sets it to a share of the work, 0 to 1."""
+    from rich.progress import Progress
+
     with Progress(console=progress_console(), transient=True) as progress:
         task = progress.add_task(description, total=1.0)
         yield lambda share: progress.update(task, completed=share)

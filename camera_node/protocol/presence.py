@@ -3,14 +3,13 @@
 name that was probably meant.
 """
 
-import difflib
 import time
 from collections.abc import Collection
 
 import zenoh
 
 from camera_node.foundation.config import is_name
-from camera_node.foundation.errors import printable
+from camera_node.foundation.errors import most_similar, printable
 from camera_node.protocol.session import guarded
 
 ALIVE = "*/fusion/alive"  # the tokens of all servers; `Keys.fusion_alive` is that of one arena
@@ -95,8 +94,8 @@ def why_no_camera(session: zenoh.Session, key: str, camera: str) -> str:
 
 def no_such(kind: str, name: str, known: Collection[str]) -> str:
     """That a name does not exist, those that do, and the one that was probably meant."""
-    similar = difflib.get_close_matches(name, known, 1)
-    hint = f"; did you mean {similar[0]}?" if similar else ""
+    similar = most_similar(name, known)
+    hint = f"; did you mean {similar}?" if similar else ""
     return f"there is no {kind} '{printable(name, 80)}', but {listed(known)}{hint}"
 
 

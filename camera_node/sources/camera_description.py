@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a driver states about a camera: its modes, its controls by name, and the check of a value before it is set."""
 
-import difflib
 from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
 
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, most_similar
 from camera_node.protocol.messages import ControlValue
 
 SHOWN = 40  # names that an error lists
@@ -52,8 +51,8 @@ def check_controls(wanted: Mapping[str, ControlValue], offered: Mapping[str, Con
 def _known(name: str, offered: Mapping[str, Control]) -> str:
     if not offered:
         return "it offers none"
-    similar = difflib.get_close_matches(name, offered, 1)
-    hint = f"did you mean {similar[0]}? " if similar else ""
+    similar = most_similar(name, offered)
+    hint = f"did you mean {similar}? " if similar else ""
     names = sorted(offered)
     rest = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return f"{hint}known: {', '.join(names[:SHOWN])}{rest}"

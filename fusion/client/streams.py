@@ -4,7 +4,6 @@
 A reader that is slower than the messages gets the newest one and skips the others.
 """
 
-import asyncio
 import contextlib
 import math
 import threading
@@ -94,6 +93,8 @@ class Stream(Generic[T]):
         return self._follow(self.timeout_s)
 
     async def __aiter__(self) -> AsyncIterator[T]:
+        import asyncio  # a tenth of the start of a program that does not need it
+
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()
 
         def wake(_: T) -> None:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The live server's settings: `configs/arena.yaml`, all of them with defaults."""
 
-import difflib
 import re
 from collections import Counter
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from camera_node.foundation.config import NAME_RULE, is_name, load_yaml
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, most_similar
 from camera_node.protocol.session import LOOPBACK
 from fusion.model.limits import LimitSettings
 
@@ -90,8 +89,8 @@ class ArenaConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
                 f"zones: '{repeated[0]}' is there twice; each zone has a name and cameras of its own"
             )
         if self.zone is not None and self.zone not in names:
-            similar = difflib.get_close_matches(self.zone, names, 1)
-            hint = f"did you mean {similar[0]}? " if similar else ""
+            similar = most_similar(self.zone, names)
+            hint = f"did you mean {similar}? " if similar else ""
             known = f"the zones are {', '.join(names)}" if names else "arena.yaml has no zones"
             raise ValueError(f"there is no zone '{self.zone}'; {hint}{known}")
 

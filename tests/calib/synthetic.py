@@ -21,7 +21,7 @@ from camera_node.protocol.messages import Detections
 WAND = Body(diameter_m=0.12, markers=((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.5, 0.0, 0.0)))
 STICK = Body(diameter_m=0.05, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
 PERIOD_NS = 100_000_000
-RIM = 16  # points of a disc's rim
+RIM = 12  # points of a disc's rim, which give its outline to 1e-9 px
 # Standard deviations of lens errors: relative focal length, principal point in pixels, k1.
 EXACT, CAREFUL, OLD, SHEET = (0.0, 0.0, 0.0), (6e-4, 0.5, 5e-4), (4e-3, 2.0, 5e-3), (0.02, 10.0, 0.03)
 

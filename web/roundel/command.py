@@ -4,7 +4,6 @@
 import logging
 import os
 import sys
-from importlib.metadata import version
 
 from calib.commands import COMMANDS as CALIBRATION
 from camera_node.commands import COMMANDS as CAMERAS
@@ -52,6 +51,8 @@ def main() -> None:
 def execute(*arguments: str) -> int | None:
     """Run a command line; return its exit code."""
     if arguments == ("--version",):
+        from importlib.metadata import version
+
         print(f"roundel {version('roundel')}")
         return 0
     return run_one_of(COMMANDS, arguments or ("--help",), "roundel", overview)
