@@ -213,11 +213,12 @@ def eliminate_robots(
     n_cameras: int,
     damping: float,
     /,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """(8 C, 8 C + 1) normal equations of C cameras with their right side, robots eliminated (Schur complement).
 
     Also (B, 12, 8 C + 1) and (M, 3, 8 C + 1): the errors of the B bodies and of the places of the M markers are the
-    last column less the others times the errors of the cameras. Equations (N, 2, 12 + 8 + 3 + 1): derivatives by body,
+    last column less the others times the errors of the cameras. And (3 M, 3 M): the information about the places with
+    the cameras as they are, 0 between the markers of two robots. Equations (N, 2, 12 + 8 + 3 + 1): derivatives by body,
     camera and place, and residuals; weights, body, camera and marker (N,); robot (B,) of each body and owner (M,) of
     each marker, in ascending order; information and right sides (B, 12) and (M, 3) beside the observations; `damping`
     is the share by which their diagonals grow. Raises RuntimeError where a body or a marker is not determined.

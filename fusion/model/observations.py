@@ -22,6 +22,7 @@ from fusion import _core
 from fusion._core import SLACK_PX
 from fusion.model.corrections import with_errors_of
 from fusion.model.frames import FrameSet
+from fusion.model.marker_places import PLACE_M, frame_covariance
 from fusion.model.robots import Robot
 from fusion.model.states import States
 from fusion.model.undistortion import (
@@ -336,6 +337,11 @@ def _zeros(robot: Robot) -> Array:
     return robot.code_axes.T if robot.needs_headings else np.full((3, len(robot.markers)), np.nan)
 
 
+def _frame_covariance(robot: Robot) -> Array:
+    """(6, 6) see `MarkerTable`, by the tolerance of places that were measured or drawn."""
+    return frame_covariance(robot.points, PLACE_M**2 * np.eye(3 * len(robot.markers)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerTable(Columns):
     """All K markers of all robots.
@@ -348,10 +354,11 @@ class MarkerTable(Columns):
         code: (K,) of the marker, 0 for none.
         zero: (3, K) direction of its zero, body frame; NaN for robots that need no headings (`Body.needs_headings`).
         first: (R + 1,): robot r has the rows first[r] to first[r + 1].
+        frame: (R, 6, 6) covariance of the rotation and position (body frame) of each robot by errors of the places.
     """
 
     ROW_AXIS: ClassVar[int] = -1
-    SHARED: ClassVar[frozenset[str]] = frozenset({"first"})
+    SHARED: ClassVar[frozenset[str]] = frozenset({"first", "frame"})
 
     robot: Index
     number: Index
@@ -361,6 +368,7 @@ class MarkerTable(Columns):
     code: Index
     zero: Array
     first: Index
+    frame: Array
 
     @classmethod
     def of(cls, robots: list[Robot]) -> "MarkerTable":
@@ -375,11 +383,13 @@ class MarkerTable(Columns):
             np.concatenate([np.empty(0, np.intp), *(robot.codes for robot in robots)]).astype(np.intp),
             np.concatenate([np.empty((3, 0)), *(_zeros(robot) for robot in robots)], axis=1),
             np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
+            np.array([_frame_covariance(robot) for robot in robots]).reshape(-1, 6, 6),
         )
 
-    def place(self, rows: Index, position: Array) -> None:
-        """The markers `rows` are at other places (K, 3) on their robots."""
-        self.position[:, rows] = position.T
+    def place(self, robot: int, position: Array, frame: Array) -> None:
+        """The markers of a robot are at other places (m, 3), with this covariance (6, 6) of its frame."""
+        self.position[:, self.first[robot] : self.first[robot + 1]] = position.T
+        self.frame[robot] = frame
 
     def discs(self, rows: Index, frame: Index) -> Discs:
         """The markers `rows`, each in one frame."""

@@ -33,11 +33,11 @@ class CameraMonitors:
         """Cameras whose frames `admit` refuses: their images are frozen."""
         return self.frozen.names
 
-    def inherit(self, old: "CameraMonitors") -> None:
-        """Continue with the same cameras and other robots."""
+    def inherit(self, old: "CameraMonitors", same: Mapping[int, int]) -> None:
+        """Continue with the same cameras and other robots; `same` has old rows by new row."""
         self.clocks.inherit(old.clocks)
         self.frozen.inherit(old.frozen)
-        self.rig.inherit(old.rig)
+        self.rig.inherit(old.rig, same)
 
     def admit(
         self, frame: CalibratedFrame, robots_now: Callable[[], Snapshot | None]

@@ -131,10 +131,13 @@ void eliminate_robot(const JointSystem& system, const ByBody& of, const RobotPri
         eliminate_body(block, seen_columns(system, of, {b}, shared, end), shared);
     }
     shared.add(priors, first_marker, end);
+    const size_t first = kPlaceErrors * first_marker, n_places = kPlaceErrors * system.n_markers;
+    for (size_t i = d; i < end; ++i)
+        std::copy_n(shared.row(i) + d, end - d, to.of_places + (first + i - d) * n_places + first);
     shared.eliminate_places(seen_columns(system, of, bodies, shared, end), end);
     const auto column = [&](size_t j) { return j < d ? j : right; };
     for (size_t i = d; i < end; ++i) {
-        double* row = to.by_marker + (kPlaceErrors * first_marker + i - d) * (d + 1);
+        double* row = to.by_marker + (first + i - d) * (d + 1);
         for (size_t j = 0; j <= d; ++j) row[j] = shared.at(i, column(j));
     }
     for (size_t n = 0; n < bodies.size(); ++n)

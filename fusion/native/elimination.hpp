@@ -36,8 +36,10 @@ struct RobotPriors {
 /// Where the results are written. With d = 8 n_cameras, `reduced` takes d x (d + 1): the information about
 /// the cameras and its right side; `by_body` takes n_bodies x 12 x (d + 1) and `by_marker` n_markers x 3 x
 /// (d + 1): the errors of bodies and markers are the last column less the others times those of the cameras.
+/// `of_places` takes 3 n_markers x 3 n_markers: the information about places with the cameras as they are, 0
+/// between the markers of two robots.
 struct Eliminated {
-    double *reduced, *by_body, *by_marker;
+    double *reduced, *by_body, *by_marker, *of_places;
 };
 
 /// Eliminates the bodies and the places of their markers. Throws std::runtime_error where a body or a marker

@@ -22,6 +22,7 @@ from calib.rig.camera_errors import ERRORS, errors_of_size
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
+from fusion.model.marker_places import PLACE_M
 from fusion.model.observations import MatchedObservations
 from fusion.model.states import OMEGA, POSITION, VELOCITY, States
 
@@ -32,7 +33,7 @@ Cause = Literal["pose", "clock", "focal", "wand", "shape"]
 # jumps of a clock.
 FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [0.1, 0.1])
 WAND_SIGMA = 0.05  # of the rig's size, if the lengths of the wand are wrong
-SHAPE_M, FREE_SHAPE_M = 3e-4, 0.02  # of a marker's place that was measured or drawn, and if that is wrong
+FREE_SHAPE_M = 0.02  # of a marker's place that was measured or drawn wrong
 POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
 RIVAL = 1e-3  # likelihood of another explanation, relative to the accepted one
@@ -180,6 +181,8 @@ class Fit:
         prior: (8 C, 8 C) information about the errors by the calibration, where they are not free.
         reduced: (8 C, 8 C + 1) normal equations of the errors by the observations, robots and the places of their
             markers eliminated.
+        by_marker, of_places: how the places follow the cameras, and the information about them; see
+            `_core.eliminate_robots`.
         rows: (N, 2, 12 + 8 + 3 + 1) whitened derivatives of the observations by the errors of their bodies, cameras and
             places, and residuals.
         squared: (N,) squared whitened residuals; NaN where the disc is not visible.
@@ -194,6 +197,8 @@ class Fit:
     places: Array
     prior: Array
     reduced: Array
+    by_marker: Array
+    of_places: Array
     rows: Array
     squared: Array
     size: float = 0.0
@@ -208,6 +213,19 @@ class Fit:
         """Least squares H e = y, (8 C, 8 C) and (8 C,), about the errors by the observations alone."""
         H, g = self.reduced[:, :-1], self.reduced[:, -1]
         return H / self.variance, (g + H @ self.errors.ravel()) / self.variance
+
+    def equations_of_places(self, markers: Index) -> tuple[Array, Array]:
+        """Least squares H p = y, (3 m, 3 m) and (3 m,), about the places of `markers` (m,) of one robot, which are
+        free, by the observations and what the hypothesis has of the cameras: all else is eliminated."""
+        rows = (3 * markers[:, None] + np.arange(3)).ravel()
+        given_cameras = self.by_marker[markers].reshape(len(rows), -1)
+        by_cameras, step = given_cameras[:, :-1], given_cameras[:, -1]
+        given = self.of_places[np.ix_(rows, rows)]
+        cross, cameras = given @ by_cameras, self.reduced[:, :-1] + self.prior
+        H = given - cross @ np.linalg.solve(cameras + by_cameras.T @ cross, cross.T)
+        of_cameras = np.linalg.solve(cameras, self.reduced[:, -1] - self.prior @ self.errors.ravel())
+        y = H @ (self.places[markers].ravel() + step - by_cameras @ of_cameras)
+        return (H - np.eye(len(H)) / FREE_SHAPE_M**2) / self.variance, y / self.variance
 
     @property
     def variance(self) -> float:
@@ -467,14 +485,15 @@ def fit(window: Window, hypothesis: Hypothesis) -> Fit:
         at, damping = tried, damping / 10
         if is_converged:
             break
-    reduced, *_ = _eliminate(window, priors, at, 0.0)
+    reduced, _, by_marker, of_places = _eliminate(window, priors, at, 0.0)
     penalty = float(hypothesis.n_free(window) * np.log(2 * len(at.squared)))
     if hypothesis.scale != 1.0:
         stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
         penalty += np.log(2 * len(at.squared)) + larger - stated
     found = at.errors, at.bodies, at.places, priors.cameras
     size = float(at.errors.ravel() @ window.growth / (window.growth @ window.growth))
-    return Fit(hypothesis, at.cost, penalty, *found, reduced, at.rows, at.squared, size)
+    reduced_to = reduced, by_marker, of_places
+    return Fit(hypothesis, at.cost, penalty, *found, *reduced_to, at.rows, at.squared, size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -497,7 +516,7 @@ class _Priors:
         bodies = np.tile([rotation**-2.0] * 3 + [position**-2.0] * 3 + [0.0] * 6, (len(window.states), 1))
         bodies[:, OMEGA] = (window.velocity_sigma[:, 0] ** -2)[:, None]
         bodies[:, VELOCITY] = (window.velocity_sigma[:, 1] ** -2)[:, None]
-        place_m = np.where(np.isin(window.owner, hypothesis.robots), FREE_SHAPE_M, SHAPE_M)
+        place_m = np.where(np.isin(window.owner, hypothesis.robots), FREE_SHAPE_M, PLACE_M)
         return cls(
             np.asarray(np.linalg.inv(covariance), float), bodies, np.repeat(place_m[:, None] ** -2, 3, axis=1)
         )
@@ -557,7 +576,9 @@ def _evaluate(window: Window, priors: _Priors, errors: Array, bodies: Array, pla
     return _Point(errors, bodies, places, rows, squared, cost + priors.cost(errors, bodies, places))
 
 
-def _eliminate(window: Window, priors: _Priors, at: _Point, damping: float) -> tuple[Array, Array, Array]:
+def _eliminate(
+    window: Window, priors: _Priors, at: _Point, damping: float
+) -> tuple[Array, Array, Array, Array]:
     """See `_core.eliminate_robots`."""
     weights = 1 / (1 + np.nan_to_num(at.squared) / _core.CAUCHY**2)
     of_rows = window.observations.discs.body, window.camera, window.marker
@@ -568,7 +589,7 @@ def _eliminate(window: Window, priors: _Priors, at: _Point, damping: float) -> t
 
 def _step(window: Window, priors: _Priors, at: _Point, damping: float) -> tuple[Array, Array, Array]:
     """Steps (C, 8) of the cameras, (B, 12) of the bodies and (M, 3) of the places."""
-    reduced, by_body, by_place = _eliminate(window, priors, at, damping)
+    reduced, by_body, by_place, _ = _eliminate(window, priors, at, damping)
     H = reduced[:, :-1] + priors.cameras
     H[np.diag_indices(len(H))] += damping * np.abs(np.diag(reduced))
     step = np.asarray(np.linalg.solve(H, reduced[:, -1] - priors.cameras @ at.errors.ravel()), float)

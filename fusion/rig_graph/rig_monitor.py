@@ -53,12 +53,12 @@ from fusion.rig_graph.hypotheses import (
 )
 from fusion.rig_graph.keyframes import GATES_PX, N_MEAN, Keyframe, Keyframes, Moments, window_of
 from fusion.rig_graph.refinement import Refinement
-from fusion.rig_graph.robot_shapes import RobotShapes, displacements
+from fusion.rig_graph.robot_shapes import RobotShapes, Shape
 
 log = logging.getLogger("fusion")
 T = TypeVar("T")
 Equations = tuple[int, Array, Array]  # Unix time in ns, and H (8 C, 8 C) and y (8 C,) of `ClockWalk.update`
-Measured = tuple[Equations, dict[int, Array]]  # and `displacements`
+Measured = tuple[Equations, dict[int, Shape]]  # and by row of the robots
 Judgement = tuple[Window, Verdict, Measured | None]
 NICENESS = 10  # of the process that judges: poses and detections come first
 # Keyframes that are judged: the more, the better they determine a camera; the fewer, the sooner all of them are new.
@@ -129,9 +129,10 @@ class RigMonitor:
         self.pinned: set[str] = set()
         self.contradicting: tuple[str, ...] = ()
 
-    def inherit(self, old: "RigMonitor") -> None:
-        """Continue with the same cameras and other robots."""
+    def inherit(self, old: "RigMonitor", same: Mapping[int, int]) -> None:
+        """Continue with the same cameras and other robots; `same` has old rows by new row."""
         self.inherit_poses(old)
+        self._shapes.inherit(old._shapes, same)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
         self._moved = old._moved
         self._scale, self._doubted, self._refinement = old._scale, old._doubted, old._refinement
@@ -181,6 +182,11 @@ class RigMonitor:
         for departure in found:
             self._keyframes.retime(self._cameras.names[departure.camera], departure.at)
         return found
+
+    @property
+    def displaced_m(self) -> dict[int, float]:
+        """By row of each robot whose markers are not where they are declared, the largest distance."""
+        return self._shapes.displaced_m
 
     def take_placed(self) -> bool:
         """Whether markers are used at other places on their robots since the last call."""
@@ -256,7 +262,8 @@ class RigMonitor:
         self._checked_ns, self._revision = now_ns, self._cameras.revision
         self._given = self._cameras.as_dict(), self._scale, self._markers  # of this time
         self._given_ns, self._is_confirmed = kept[-1].t_ns, False
-        self._start(partial(judge_latest, kept, *self._given, self._measured_ns, sorted(self._moved)))
+        given = self._shapes, self._measured_ns, sorted(self._moved)
+        self._start(partial(judge_latest, kept, *self._given, *given))
 
     def _exclude_displaced(self, displaced: Mapping[int, int]) -> ExtrinsicsCorrection | None:
         if len(displaced) != 1:
@@ -401,7 +408,7 @@ class RigMonitor:
         if measured is None or not self.refines or self.excluded or not is_of_robots:
             return
         self._measured_ns = self._given_ns
-        if self._shapes.add(measured[1]):
+        if self._shapes.use(measured[1]):
             self._has_placed = True
             self._forget()
 
@@ -487,6 +494,7 @@ class RigMonitor:
         self._forget()
         self._walk.forget_poses()
         self._refinement = None
+        self._shapes.forget()
         self._is_contradicted, self._n_undecided = False, 0
         self._scale = 1.0
         self._cameras.count_errors(1.0, 0.0)
@@ -511,18 +519,19 @@ def judge_latest(
     cameras: Mapping[str, Camera],
     error_scale: float,
     markers: MarkerTable,
+    shapes: RobotShapes,
     since_ns: int,
     moved: Sequence[str],
 ) -> Judgement | None:
     """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
-    cameras' errors is measured."""
+    errors of cameras and the shapes of robots is measured."""
     array = CameraArray(dict(cameras), error_scale)
     for n in WINDOWS:
         if n <= len(keyframes):
             window, starts = window_of(keyframes[-n:], array, markers)
             verdict = judge(window, starts, [array.index[name] for name in moved])
             if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
-                return window, verdict, _measure(window, verdict, keyframes[-n:], since_ns)
+                return window, verdict, _measure(window, verdict, keyframes[-n:], shapes, since_ns)
     return None
 
 
@@ -610,7 +619,7 @@ def _change(
 
 
 def _measure(
-    window: Window, verdict: Verdict, keyframes: Sequence[Keyframe], since_ns: int
+    window: Window, verdict: Verdict, keyframes: Sequence[Keyframe], shapes: RobotShapes, since_ns: int
 ) -> Measured | None:
     times = np.array([keyframe.t_ns for keyframe in keyframes])
     is_new = times > since_ns
@@ -619,7 +628,8 @@ def _measure(
         return None
     found = fit(shown, replace(verdict.fit.hypothesis, robots=several_markers(shown)))
     equations = int(times[is_new].mean()), *found.equations
-    return equations, displacements(shown, found)
+    markers = {robot: np.flatnonzero(window.owner == robot) for robot in found.hypothesis.robots}
+    return equations, shapes.learned({r: found.equations_of_places(rows) for r, rows in markers.items()})
 
 
 def _seeing(window: Window) -> list[str]:

@@ -1,109 +1,187 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Where the markers of robots are on these, by what windows of keyframes show: a robot may be measured wrong.
+"""Where the markers of robots are on these, by windows of keyframes: a robot may be measured wrong.
 
 docs/design/rig_graph.md has the model.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
 
 from camera_node.foundation.arrays import Array
+from fusion.model.marker_places import PLACE_M, frame_covariance
 from fusion.model.observations import MarkerTable
-from fusion.rig_graph.hypotheses import FALSE_ALARM, MAX_ITERATIONS, SHAPE_M, Fit, Window
+from fusion.rig_graph.hypotheses import FALSE_ALARM, FREE_SHAPE_M, WAND_SIGMA
 
-DISPLACED_M = 1e-3  # less is what lenses and a careful measurement by hand leave
-MIN_WINDOWS = 4  # for a variance: 3 for each coordinate of each marker
+Equations = tuple[Array, Array]  # H (3 m, 3 m) and y (3 m,) of H p = y, about displacements p of m markers
+TOLERANCES_M = PLACE_M * 2.0 ** np.arange(7)  # of the places of markers, if they are measured less well
+# Powers with which a larger tolerance of all markers, and of one, is less probable: the least that keep the claims of
+# robots of which windows show little below a millimetre.
+RARER, RARER_ONE = 2, 3
+N_GAUGE = 7  # motions of a robot and its size, which show no displacement
 
 
-@dataclass(slots=True)
-class _Mean:
-    """Of displacements (m, 3) in n windows, with the sum of their squared differences from it."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """Of the m markers of a robot.
 
-    n: int
-    mean: Array
-    squares: Array
+    Attributes:
+        equations: of all windows, about displacements from the declared places.
+        off: (m, 3) displacements, metres.
+        frame: (6, 6) covariance of the robot's frame by errors of the places; see `frame_covariance`.
+        exceeds: whether they are larger than the tolerance of a measurement explains.
+    """
 
-    def add(self, off: Array) -> None:
-        """Welford 1962."""
-        self.n += 1
-        before = off - self.mean
-        self.mean = self.mean + before / self.n
-        self.squares = self.squares + before * (off - self.mean)
-
-    @property
-    def variance(self) -> float:
-        """Of a coordinate of the mean."""
-        return float(self.squares.mean()) / (self.n - 1) / self.n
+    equations: Equations
+    off: Array
+    frame: Array
+    exceeds: bool
 
 
 class RobotShapes:
-    """The displacements of the markers of all robots from their places in `markers`."""
+    """The shapes of the robots in `markers`, where their places are declared."""
 
     def __init__(self, markers: MarkerTable) -> None:
-        self._markers = markers
-        self._means: dict[int, _Mean] = {}
+        self._markers, self._declared = markers, markers.position.copy()
+        self._known: dict[int, Shape] = {}
 
-    def add(self, displacements: Mapping[int, Array]) -> bool:
-        """Add what a window shows, (m, 3) by robot; whether markers are used at other places from now on.
+    @property
+    def displaced_m(self) -> dict[int, float]:
+        """By row of each robot whose markers are displaced beyond the tolerance, the largest distance."""
+        known = self._known.items()
+        return {k: float(np.linalg.norm(s.off, axis=1).max()) for k, s in known if s.exceeds}
 
-        A robot that has only another size stays as it is: it may be the rig that has.
-        """
-        has_placed = False
-        for robot, off in displacements.items():
-            rows = np.flatnonzero(self._markers.robot == robot)
-            places = self._markers.position[:, rows].T
-            mean = self._means.setdefault(robot, _Mean(0, np.zeros_like(off), np.zeros_like(off)))
-            mean.add(_without(_motions(places), off))
-            if mean.n < MIN_WINDOWS:
-                continue
-            of_shape = _without(_motions(places, has_size=True), mean.mean)
-            off_m = np.linalg.norm(of_shape, axis=1).max()
-            if off_m > DISPLACED_M and off_m**2 > chdtri(3, FALSE_ALARM) * mean.variance:
-                self._markers.place(rows, places + in_own_frame(places, mean.mean))
-                del self._means[robot]
-                has_placed = True
-        return has_placed
+    def inherit(self, old: "RobotShapes", same: Mapping[int, int]) -> None:
+        """Continue with the robots of another one, whose rows `same` has by row."""
+        self._known = {row: old._known[k] for row, k in same.items() if k in old._known}
+
+    def forget(self) -> None:
+        """Forget the windows: they were judged by other cameras. The places in use stay."""
+        for k, shape in self._known.items():
+            H, y = shape.equations
+            self._known[k] = replace(shape, equations=(0 * H, 0 * y))
+
+    def learned(self, windows: Mapping[int, Equations]) -> dict[int, Shape]:
+        """The shapes of robots with what a window shows of each, about displacements from the places in use."""
+        return {robot: self._learned(robot, *window) for robot, window in windows.items()}
+
+    def use(self, shapes: Mapping[int, Shape]) -> bool:
+        """Use these shapes of robots; whether a marker is elsewhere by more than the tolerance from now on."""
+        before = self._markers.position.copy()
+        for robot, shape in shapes.items():
+            self._markers.place(robot, self._places(robot) + shape.off, shape.frame)
+        self._known |= shapes
+        return bool(np.linalg.norm(self._markers.position - before, axis=0).max(initial=0.0) > PLACE_M)
+
+    def _places(self, robot: int) -> Array:
+        return self._declared[:, self._markers.robot == robot].T
+
+    def _learned(self, robot: int, H: Array, y: Array) -> Shape:
+        places, used = self._places(robot), self._markers.position[:, self._markers.robot == robot].T
+        H, y = _of_any_size(places, H, y + H @ (used - places).ravel())
+        known = self._known.get(robot)
+        if known is not None and _agree(known.equations, (H, y)):
+            H, y = known.equations[0] + H, known.equations[1] + y
+        off, covariance = posterior(H, y)
+        return Shape((H, y), off, frame_covariance(places, covariance), _exceed_tolerance(H, y))
 
 
-def displacements(window: Window, fit: Fit) -> dict[int, Array]:
-    """(m, 3) by robot of which all markers are seen: how far they are from where they are declared, metres (body
-    frame), by a fit in which their places are free."""
-    seen = np.bincount(window.marker, minlength=len(window.owner)) > 0
-    robots = [(robot, window.owner == robot) for robot in fit.hypothesis.robots]
-    return {robot: fit.places[mine] for robot, mine in robots if seen[mine].all()}
+def posterior(H: Array, y: Array) -> tuple[Array, Array]:
+    """Mean (m, 3) and covariance (3 m, 3 m) of displacements of which windows show H p = y, metres.
 
-
-def in_own_frame(places: Array, off: Array) -> Array:
-    """Displacements (m, 3) of markers at `places` (m, 3), less the motion that they have in common.
-
-    A window shows a shape, and not where a robot's frame is in it: it is where most markers stay. The cost is that of
-    Cauchy with `SHAPE_M`, from the motions of all markers but one.
+    Windows show a shape, and not where a robot's frame is in it. How well its places are measured is unknown, and how
+    well that of one marker: a mixture of normal distributions, each as likely as it makes the windows.
     """
-    motions = _motions(places)
-    starts = [_without(motions, off, 1.0 - np.eye(len(off))[k]) for k in range(len(off))]
-    found = []
-    for left in [off, *starts]:
-        for _ in range(MAX_ITERATIONS):
-            left = _without(motions, off, 1 / (1 + np.sum(left**2, axis=1) / SHAPE_M**2))
-        found.append(left)
-    return min(found, key=lambda left: np.log1p(np.sum(left**2, axis=1) / SHAPE_M**2).sum())
+    e, V = np.linalg.eigh(H)
+    known = [_Places.of(np.maximum(e, 0.0), V, y, tolerance_m) for tolerance_m in TOLERANCES_M]
+    known += [p.with_one_off(t) for p in known for t in p.larger]
+    cost = np.concatenate([p.cost for p in known])
+    shares = np.exp((cost.min() - cost) / 2)
+    shares /= shares.sum()
+    mean = shares @ np.concatenate([p.means for p in known])
+    of_each = np.split(shares, np.cumsum([len(p.cost) for p in known])[:-1])
+    parts = [p.covariance(mine, mean) for p, mine in zip(known, of_each, strict=True)]
+    return mean.reshape(-1, 3), np.sum(parts, axis=0)
 
 
-def _motions(places: Array, has_size: bool = False) -> Array:
-    """(m, 3, 6) displacements of markers by a rotation and a translation of their robot; (m, 3, 7) with its size."""
-    motions = np.zeros((len(places), 3, 6 + has_size))
-    motions[:, :, :3] = np.cross(np.eye(3), places[:, None]).transpose(0, 2, 1)
-    motions[:, :, 3:6] = np.eye(3)
-    if has_size:
-        motions[:, :, 6] = places
-    return motions
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places:
+    """Places of the markers of a robot by K hypotheses of a tolerance.
+
+    Attributes:
+        tolerance_m: of all places.
+        P: (3 m, 3 m) covariance with it.
+        cost: (K,) twice the negative logarithm of the likelihood of the windows and of the tolerances.
+        means: (K, 3 m) displacements.
+        added: (K, 3 m, 3) and (K, 3, 3): factors A and B of what the covariance of each has beside P, A B A^T.
+    """
+
+    tolerance_m: float
+    P: Array
+    cost: Array
+    means: Array
+    added: tuple[Array, Array]
+
+    @classmethod
+    def of(cls, e: Array, V: Array, y: Array, tolerance_m: float) -> "_Places":
+        """One tolerance of all places, by eigenvalues and eigenvectors of H."""
+        information = e + tolerance_m**-2
+        P = V / information @ V.T
+        cost = np.log(information * tolerance_m**2).sum() - y @ P @ y + _rarity(tolerance_m, RARER)
+        none = np.zeros((1, len(y), 3)), np.zeros((1, 3, 3))
+        return cls(tolerance_m, P, np.array([cost]), (P @ y)[None], none)
+
+    @property
+    def larger(self) -> list[float]:
+        """The larger tolerances."""
+        return [t for t in TOLERANCES_M.tolist() if t > self.tolerance_m]
+
+    def with_one_off(self, tolerance_m: float) -> "_Places":
+        """Each of the markers has a larger tolerance than the others."""
+        n, less = len(self.P) // 3, self.tolerance_m**-2 - tolerance_m**-2
+        columns = self.P.reshape(-1, n, 3).transpose(1, 0, 2)
+        left = np.eye(3) - less * columns.reshape(n, n, 3, 3)[range(n), range(n)]
+        B, off = np.asarray(less * np.linalg.inv(left), float), self.means.reshape(n, 3)
+        of_one = 6 * np.log(tolerance_m / self.tolerance_m) + np.linalg.slogdet(left)[1]
+        cost = self.cost + of_one - np.einsum("ki,kij,kj->k", off, B, off) + _rarity(tolerance_m, RARER_ONE)
+        return _Places(
+            tolerance_m, self.P, cost, self.means + np.einsum("kia,kab,kb->ki", columns, B, off), (columns, B)
+        )
+
+    def covariance(self, shares: Array, mean: Array) -> Array:
+        """(3 m, 3 m) the part by hypotheses that have these shares (K,) of a mixture with a mean."""
+        A, B = self.added
+        added = np.tensordot(A @ (shares[:, None, None] * B), A, axes=([0, 2], [0, 2]))
+        off = self.means - mean
+        return shares.sum() * self.P + added + off.T @ (shares[:, None] * off)
 
 
-def _without(motions: Array, off: Array, weight: Array | float = 1.0) -> Array:
-    """What motions (m, 3, n), by weighted least squares, leave of displacements (m, 3)."""
-    root = np.sqrt(np.broadcast_to(weight, len(off)))[:, None]
-    rows = (root[:, :, None] * motions).reshape(-1, motions.shape[2])
-    return off - motions @ np.linalg.lstsq(rows, (root * off).ravel(), rcond=None)[0]
+def _rarity(tolerance_m: float, power: int) -> float:
+    """Twice the negative logarithm of how probable a tolerance is: it falls with this power."""
+    return 2 * power * float(np.log(tolerance_m / PLACE_M))
+
+
+def _of_any_size(places: Array, H: Array, y: Array) -> Equations:
+    """The equations if the robot's size is unknown, since the rig may have another one."""
+    size = H @ places.ravel()
+    total = WAND_SIGMA**-2 + places.ravel() @ size
+    return H - np.outer(size, size) / total, y - size * (places.ravel() @ y) / total
+
+
+def _agree(known: Equations, window: Equations) -> bool:
+    """Whether a window shows what those before did."""
+    (H_known, y_known), (H, y) = known, window
+    least = np.eye(len(y)) / FREE_SHAPE_M**2
+    P = np.linalg.inv(H_known + least)
+    off = y - H @ P @ y_known
+    cost = off @ np.linalg.solve(H + least, np.linalg.solve(np.eye(len(y)) + H @ P, off))
+    return bool(cost < chdtri(len(y), FALSE_ALARM))
+
+
+def _exceed_tolerance(H: Array, y: Array) -> bool:
+    """Whether displacements of which windows show H p = y are larger than the tolerance explains: a score test."""
+    larger = np.linalg.solve(np.eye(len(y)) + PLACE_M**2 * H, y)
+    cost = y @ np.linalg.solve(H + np.eye(len(y)) / FREE_SHAPE_M**2, larger)
+    return bool(cost > chdtri(max(1, len(y) - N_GAUGE), FALSE_ALARM))

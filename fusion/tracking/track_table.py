@@ -32,7 +32,8 @@ class TrackTable:
         searched: (N,) robots that it acquires while they are missing; the others belong to other zones.
         states: at `t_ns`; a new object after each change.
         status: None for a robot that was never acquired.
-        claimed: (N, 12, 12) covariances of the states with the errors of the cameras, which the states' own lack.
+        claimed: (N, 12, 12) covariances of the states with the errors of the cameras and of the places of markers,
+            which the states' own lack.
         t_ns: time of the last frame set, or None before the first.
     """
 
@@ -93,18 +94,15 @@ class TrackTable:
             self.states = self.states.with_rows(np.array([row]), old.states.select(np.array([k])))
             self.status[row], self._seen_ns[row] = old.status[k], old._seen_ns[k]
             self._seen[row], same[row] = old._seen[k], k
-            self.markers.place(
-                np.flatnonzero(self.markers.robot == row),
-                old.markers.position[:, old.markers.robot == k].T,
-            )
+            used = old.markers.position[:, old.markers.robot == k]
+            self.markers.place(row, used.T, old.markers.frame[k])
         return same
 
-    def displaced_m(self) -> dict[str, float]:
-        """By name of each robot whose markers are used at other places than declared, the largest distance."""
-        declared = np.concatenate([np.zeros((0, 3)), *(robot.points for robot in self.robots)])
-        off_m = np.zeros(len(self.robots))
-        np.maximum.at(off_m, self.markers.robot, np.linalg.norm(self.markers.position.T - declared, axis=1))
-        return {self.names[k]: float(off_m[k]) for k in np.flatnonzero(off_m).tolist()}
+    def claim(self, covariance: Array) -> None:
+        """Claim covariances (N, 12, 12) of the states and the errors of the places of markers on their robots."""
+        turned = np.zeros((len(covariance), 12, 6))
+        turned[:, THETA, :3], turned[:, POSITION, 3:] = np.eye(3), self.states.R
+        self.claimed = covariance + turned @ self.markers.frame @ turned.transpose(0, 2, 1)
 
     def interval_s(self, t_ns: int) -> float:
         """The prediction interval from the last frame set to `t_ns`."""

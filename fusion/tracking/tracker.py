@@ -12,6 +12,7 @@ from camera_node.foundation.arrays import Index, Mask
 from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
+from fusion.model.marker_places import PLACE_M
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import Snapshot
@@ -19,7 +20,6 @@ from fusion.monitoring.camera_monitors import CameraMonitors
 from fusion.monitoring.size_check import SizeCheck
 from fusion.protocol.arena_health import describe_contradiction
 from fusion.protocol.pose_messages import Contradiction, RobotPose
-from fusion.rig_graph.hypotheses import SHAPE_M
 from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import AssignedFrames, AssociatedFrames, Association, OwnDetections
 from fusion.tracking.claim_check import ClaimCheck
@@ -208,11 +208,12 @@ class Tracker:
             renamed: old name -> new name.
         """
         other = Tracker(self.cameras.as_dict(), robots, self.limits, self._recalibrates)
-        other.monitors.inherit(self.monitors)
         other.robust.inherit(self.robust)
         other.acquires_none = self.acquires_none
-        other.rig_response.inherit(self.rig_response, other.table.inherit(self.table, renamed))
-        other.table.claimed = other.rig_response.claimed(other.table.states.P)
+        same = other.table.inherit(self.table, renamed)
+        other.monitors.inherit(self.monitors, same)
+        other.rig_response.inherit(self.rig_response, same)
+        other.table.claim(other.rig_response.claimed(other.table.states.P))
         return other
 
     def contradictions(self) -> tuple[Contradiction, ...]:
@@ -220,9 +221,12 @@ class Tracker:
         when it first appears."""
         displaced = tuple(
             Contradiction(
-                kind="robot", names=(name,), error_over_claim=(off_m / SHAPE_M) ** 2, size_mm=1e3 * off_m
+                kind="robot",
+                names=(self.table.names[k],),
+                error_over_claim=(off_m / PLACE_M) ** 2,
+                size_mm=1e3 * off_m,
             )
-            for name, off_m in self.table.displaced_m().items()
+            for k, off_m in self.monitors.rig.displaced_m.items()
         )
         for contradiction in displaced:
             if contradiction.names[0] not in self._displaced:
@@ -242,7 +246,7 @@ class Tracker:
 
     def _claim(self) -> None:
         """State the covariances of the robots with the errors of the cameras."""
-        self.table.claimed = self.rig_response.claimed(self.table.states.P, self.robust.added_px2)
+        self.table.claim(self.rig_response.claimed(self.table.states.P, self.robust.added_px2))
 
     def _misses_bodies(self, tracked: Mask) -> bool:
         """Whether a constellation is missing, whose acquisition can displace a single-marker robot."""

@@ -34,6 +34,7 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
     """Of all robots in all frame sets after the start."""
     cameras = precise(load.rig)
     tracker = Tracker(cameras, load.bodies)
+    tracker.table.markers.frame[:] = 0.0  # of robots that are measured as precisely as the cameras
     known = KnownFilter(cameras, load.bodies, lambda t_ns: load.paths.at((t_ns - START_NS) * 1e-9))
     mine, theirs, variance, honesty, tracked = [], [], [], [], []
     for k, frame_set in enumerate(frame_sets(load, seconds)):

@@ -14,6 +14,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.geometry.pose import Pose, look_at, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from fusion.model.frames import CalibratedFrame
+from fusion.model.marker_places import PLACE_M
 from fusion.model.observations import MarkerTable
 from fusion.model.robots import Robot
 from tests.calib.synthetic import fit_ellipses
@@ -46,6 +47,12 @@ def ring(
         f"cam{k}": Camera(**lens, distortion=distortion, T_world_cam=Pose.from_matrix(T))
         for k, T in enumerate(poses)
     }
+
+
+def measured(robot: Robot, rng: np.random.Generator) -> Robot:
+    """A robot as someone measured it."""
+    points = robot.points + PLACE_M * rng.standard_normal(robot.points.shape)
+    return msgspec.structs.replace(robot, markers=tuple(map(tuple, points.tolist())))
 
 
 def precise(cameras: dict[str, Camera], error_px: float = 1e-3) -> dict[str, Camera]:

@@ -70,10 +70,12 @@ auto eliminate_robots(const In<double, -1, 2, 24>& equations, const Numbers& wei
     auto [reduced, to_reduced] = make({d, d + 1});
     auto [by_body, to_body] = make({n_bodies, kErrors, d + 1});
     auto [by_marker, to_marker] = make({n_markers, kPlaceErrors, d + 1});
+    auto [places, to_places] = make({kPlaceErrors * n_markers, kPlaceErrors * n_markers});
     std::fill_n(to_marker, by_marker.size(), 0.0);
-    const Eliminated to{to_reduced, to_body, to_marker};
+    std::fill_n(to_places, places.size(), 0.0);
+    const Eliminated to{to_reduced, to_body, to_marker, to_places};
     unlocked([&] { eliminate(system, priors, to); });
-    return std::make_tuple(reduced, by_body, by_marker);
+    return std::make_tuple(reduced, by_body, by_marker, places);
 }
 
 auto predict_bodies(const BodyStates& bodies, const Covariances& P, const Numbers& dt,

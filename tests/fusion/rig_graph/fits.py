@@ -17,4 +17,4 @@ def fitted(
     found = np.zeros((n_cameras, ERRORS)), np.zeros((0, 12)), np.zeros((0, 3)), np.eye(n) / scale**2
     reduced, penalty = np.zeros((n, n + 1)), float(hypothesis.free.sum() * np.log(800))
     hypothesis = replace(hypothesis, scale=scale)
-    return Fit(hypothesis, cost, penalty, *found, reduced, empty, np.full(400, 1.0))
+    return Fit(hypothesis, cost, penalty, *found, reduced, empty, empty, empty, np.full(400, 1.0))

@@ -12,6 +12,7 @@ from fusion import _core
 from fusion.rig_graph.hypotheses import (
     CAUSES,
     ERRORS,
+    FREE_SHAPE_M,
     Hypothesis,
     decide,
     is_contradicted,
@@ -93,11 +94,13 @@ def system() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray
     return D, rng.uniform(0.1, 1, n), body, rng.integers(0, CAMERAS_SEEING, n), marker
 
 
-def test_elimination_gives_the_solution_of_the_whole_system():
+N_ROBOTS = 12 * BODIES + 3 * len(OWNER)  # errors of bodies and of the places of markers
+
+
+def whole_system(priors: list[np.ndarray], rights: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of the errors of bodies, of places and of cameras."""
     D, weights, body, camera, marker = system()
-    rng, n, n_robots = np.random.default_rng(6), len(D), 12 * BODIES + 3 * len(OWNER)
-    priors = [rng.uniform(0.5, 2, (k, m)) for k, m in ((BODIES, 12), (len(OWNER), 3))]
-    rights = [rng.normal(size=prior.shape) for prior in priors]
+    n, n_robots = len(D), N_ROBOTS
     A = np.zeros((n, 2, n_robots + ERRORS * CAMERAS_SEEING))
     firsts = [12 * body, n_robots + ERRORS * camera, 12 * BODIES + 3 * marker]
     for k in range(n):
@@ -106,13 +109,48 @@ def test_elimination_gives_the_solution_of_the_whole_system():
     H, g = np.einsum("n,nai,naj->ij", weights, A, A), np.einsum("n,nai,na->i", weights, A, D[:, :, -1])
     H[range(n_robots), range(n_robots)] += np.concatenate([prior.ravel() for prior in priors])
     g[:n_robots] += np.concatenate([right.ravel() for right in rights])
+    return H, g
+
+
+def test_elimination_gives_the_solution_of_the_whole_system():
+    D, weights, body, camera, marker = system()
+    rng, n_robots = np.random.default_rng(6), N_ROBOTS
+    priors = [rng.uniform(0.5, 2, (k, m)) for k, m in ((BODIES, 12), (len(OWNER), 3))]
+    rights = [rng.normal(size=prior.shape) for prior in priors]
+    H, g = whole_system(priors, rights)
     whole = np.linalg.solve(H, g)
     given = ROBOT, OWNER, priors[0], rights[0], priors[1], rights[1], CAMERAS_SEEING, 0.0
-    reduced, *by = _core.eliminate_robots(D, weights, body, camera, marker, *given)
+    reduced, *by, of_places = _core.eliminate_robots(D, weights, body, camera, marker, *given)
     step = np.linalg.solve(reduced[:, :-1], reduced[:, -1])
     np.testing.assert_allclose(step, whole[n_robots:], rtol=1e-8, atol=1e-10)
     found = [(b[:, :, -1] - b[:, :, :-1] @ step).ravel() for b in by]
     np.testing.assert_allclose(np.concatenate(found), whole[:n_robots], rtol=1e-8, atol=1e-10)
+    covariance = np.linalg.inv(H[:n_robots, :n_robots])[12 * BODIES :, 12 * BODIES :]
+    np.testing.assert_allclose(of_places @ covariance, np.eye(len(of_places)), atol=1e-9)
+
+
+def test_a_fit_shows_the_places_of_a_robot_as_the_whole_system_does():
+    """With all else unknown, and from a point of the search that is not its end."""
+    D, weights, body, camera, marker = system()
+    rng, none = np.random.default_rng(7), fitted(None, (), CAMERAS_SEEING, 0.0)
+    places, errors = rng.normal(size=(len(OWNER), 3)), rng.normal(size=(CAMERAS_SEEING, ERRORS))
+    bodies, known = np.ones((BODIES, 12)), np.full((len(OWNER), 3), FREE_SHAPE_M**-2)
+    given = ROBOT, OWNER, bodies, 0 * bodies, known, -known * places, CAMERAS_SEEING, 0.0
+    reduced, _, *of_places = _core.eliminate_robots(D, weights, body, camera, marker, *given)
+    found = replace(none, errors=errors, places=places, reduced=reduced)
+    found = replace(found, by_marker=of_places[0], of_places=of_places[1])
+    H, g = whole_system([bodies, known], [0 * bodies, -known * places])
+    H[N_ROBOTS:, N_ROBOTS:] += none.prior
+    g[N_ROBOTS:] -= none.prior @ errors.ravel()
+    covariance, step = np.linalg.inv(H), np.linalg.solve(H, g)
+    for markers in (np.array([0, 1, 2]), np.array([3, 4])):
+        rows = 12 * BODIES + (3 * markers[:, None] + np.arange(3)).ravel()
+        of_window, y = found.equations_of_places(markers)
+        with_prior = of_window + np.eye(len(y)) / FREE_SHAPE_M**2
+        np.testing.assert_allclose(with_prior @ covariance[np.ix_(rows, rows)], np.eye(len(y)), atol=1e-6)
+        np.testing.assert_allclose(
+            np.linalg.solve(with_prior, y), places[markers].ravel() + step[rows], rtol=1e-6
+        )
 
 
 def test_the_less_is_known_of_the_places_of_markers_the_less_cameras_are_shown():

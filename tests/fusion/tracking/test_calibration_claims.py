@@ -13,6 +13,7 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import START_NS, Load, Scene
+from tests.fusion.synthetic import measured
 
 RIGS, FRAMES, HZ = 30, 8, 30.0
 FALSE_ALARM = 1e-3  # of one test
@@ -45,6 +46,7 @@ def squared_error(load: Load, cameras: dict[str, Camera], rng: np.random.Generat
     scene, (name, robot) = Scene(load), next(iter(load.bodies.items()))
     scene.cameras = CameraArray(drawn(cameras, rng))
     start = tuple(load.paths.at(0.0).p[0].tolist())
+    robot = measured(robot, rng) if len(robot.markers) > 1 else robot
     tracker = Tracker(cameras, {name: msgspec.structs.replace(robot, start_m=start)})
     for seq in range(FRAMES):
         stamps = (seq + load.phases()) / HZ

@@ -9,7 +9,7 @@ import pytest
 from fusion.model.frames import CalibratedFrame
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
-from tests.fusion.synthetic import PERIOD_NS, SINGLE, TRIANGLE, WIDE, Arena, line, precise
+from tests.fusion.synthetic import PERIOD_NS, SINGLE, TRIANGLE, WIDE, Arena, line, measured, precise
 from tests.fusion.tracks import errors, poses_of, track
 
 MOVING = line((0.2, -0.3, 0.4), velocity=(0.9, 0.6, 0.1), turn=(0.2, 0.1, 1.0), tilt=(0.1, -0.2, 0.4))
@@ -44,11 +44,13 @@ def test_free_running_cameras_are_as_accurate_as_synchronized_ones(run_arena):
 
 def test_published_covariance_matches_the_errors():
     """Squared Mahalanobis errors of the last of several poses follow chi-square with 6 degrees of freedom: the mean of
-    60 runs is 6 +- 4 sqrt(12 / 60)."""
+    60 runs, each of a robot that was measured as well as is claimed, is 6 +- 4 sqrt(12 / 60)."""
     squares, positions = [], []
     for seed in range(60):
         arena = Arena({"a": TRIANGLE}, {"a": MOVING}, sigma_px=0.1, seed=seed)
-        pose = track(replace(arena, cameras=precise(arena.cameras)), arena.frames(5))[-2].poses[0]
+        robots = {"a": measured(TRIANGLE, np.random.default_rng(seed))}
+        given = replace(arena, cameras=precise(arena.cameras), robots=robots)
+        pose = track(given, arena.frames(5))[-2].poses[0]
         e, P = errors(arena, [pose])[0], pose.covariance_matrix
         squares.append(e @ np.linalg.solve(P[:6, :6], e))
         positions.append(e[3:] @ np.linalg.solve(P[3:6, 3:6], e[3:]))
