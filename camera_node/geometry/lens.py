@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Camera intrinsics with lens distortion. Pixel (0, 0) is the centre of the top-left pixel."""
 
+import math
 from pathlib import Path
 from typing import Literal, Self
 
@@ -40,7 +41,7 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
             )
         if not (self.fx > 0 and self.fy > 0):
             raise ValueError("the focal lengths fx and fy must be above 0 pixels")
-        if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
+        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.distortion))):
             raise ValueError("intrinsics must be finite")
         allowed = (0, 4, 5, 8, 12, 14) if self.model == "pinhole" else (0, 4)
         if len(self.distortion) not in allowed:
@@ -78,6 +79,8 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
         """Project points (N, 3), camera frame, to raw pixels (N, 2); NaN for points not in front of the camera."""
         points = np.asarray(points, float).reshape(-1, 3)
         front = points[:, 2] > 1e-9
+        if len(points) and front.all():
+            return self._project(points)[0]
         uv = np.full((len(points), 2), np.nan)
         if front.any():
             uv[front] = self._project(points[front])[0]
@@ -94,6 +97,8 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True):
         """As `project_with_jacobian`, with the derivatives (N, 2, 4 + D) by the lens's `parameters` in addition."""
         points = np.asarray(points, float).reshape(-1, 3)
         front = points[:, 2] > 1e-9
+        if len(points) and front.all():
+            return self._project(points)
         shapes = ((2,), (2, 3), (2, 4 + len(self.distortion)))
         uv, J_point, J_lens = (np.full((len(points), *shape), np.nan) for shape in shapes)
         if front.any():

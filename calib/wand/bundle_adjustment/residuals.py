@@ -88,7 +88,7 @@ def find_weights(problem: Problem, observations: WandObservations, state: State)
     motion = predict_markers(problem, observations, state)
     spread = problem.density * motion.location.spread
     lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
-    J = np.nan_to_num(point_jacobians(lenses, state.cameras, observations.camera, motion.points)[1])
+    J = _known(point_jacobians(lenses, state.cameras, observations.camera, motion.points)[1])
     along = observations.stamp_sigma_s[:, None] * motion.velocity(problem.knot_s)
     by_stamp = J @ along[:, :, None]
     cov = observations.cov + spread[:, None, None] * J @ np.swapaxes(J, 1, 2)
@@ -324,8 +324,8 @@ def reprojection_jacobians(
         rows, T, lens = np.flatnonzero(observations.camera == c), state.cameras[c], state.lens(c, given)
         local = (points[rows] - T[:3, 3]) @ T[:3, :3]
         uv, *parts = pixel_jacobians(lens, local)
-        J, J_pose, J_lens = (np.nan_to_num(part) for part in parts)
-        error[rows] = np.nan_to_num(observations.uv[rows] - uv)
+        J, J_pose, J_lens = (_known(part) for part in parts)
+        error[rows] = _known(observations.uv[rows] - uv)
         J_point[rows] = J @ T[:3, :3].T
         J_camera[rows, :, :6], J_camera[rows, :, LENS[0] :] = J_pose, J_lens
     J_camera[:, :, 6] = (J_point @ velocity[:, :, None])[:, :, 0]
@@ -457,15 +457,19 @@ def _linearize_images(problem: Problem, state: State) -> tuple[Array, Array, Arr
     background = problem.background
     n, points = len(background.uv), state.points[background.point]
     error, J_point, J_camera = np.empty((n, 2)), np.empty((n, 2, 3)), np.zeros((n, 2, PER_CAMERA))
-    for c, given in enumerate(problem.lenses):
-        rows, T = np.flatnonzero(background.camera == c), state.cameras[c]
-        uv, J, J_pose, J_lens = pixel_jacobians(state.lens(c, given), (points[rows] - T[:3, 3]) @ T[:3, :3])
+    for c in np.unique(background.camera).tolist():
+        rows, T, lens = (
+            np.flatnonzero(background.camera == c),
+            state.cameras[c],
+            state.lens(c, problem.lenses[c]),
+        )
+        uv, J, J_pose, J_lens = pixel_jacobians(lens, (points[rows] - T[:3, 3]) @ T[:3, :3])
         error[rows], J_point[rows] = background.uv[rows] - uv, J @ T[:3, :3].T
         J_camera[rows, :, :6], J_camera[rows, :, LENS[0] :] = J_pose, J_lens
     root = np.linalg.inv(np.linalg.cholesky(background.cov))
     errors = np.nan_to_num((root @ error[:, :, None])[:, :, 0], nan=BEHIND)
     J_camera = J_camera[:, :, list(problem.free)]
-    return errors, np.nan_to_num(root @ J_camera), np.nan_to_num(root @ J_point)
+    return errors, _known(root @ J_camera), _known(root @ J_point)
 
 
 def _step_points(problem: Problem, state: State, weight: Array) -> State:
@@ -483,3 +487,8 @@ def _nearest_to_rays(problem: Problem, state: State, background: BackgroundPoint
         rows = background.camera == c
         xy[c, 0, background.point[rows]] = state.lens(c, given).normalise(background.uv[rows])
     return intersect_images(xy, state.cameras)[0][0]
+
+
+def _known(values: Array) -> Array:
+    """The values, zeros behind a camera, where they are NaN; `np.nan_to_num` takes twice as long."""
+    return np.where(np.isfinite(values), values, 0.0)

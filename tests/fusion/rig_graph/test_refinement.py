@@ -113,6 +113,7 @@ def test_poses_that_drift_are_followed():
     cameras, rng = ring(4), np.random.default_rng(3)
     axes = rng.normal(size=(4, 3))
     axes *= np.radians(0.5) / 3600 / np.linalg.norm(axes, axis=1, keepdims=True)
+    metrics = image_metrics(list(cameras.values()))
     refinement, windows, n_corrections = Refinement(cameras, since(4)), Windows(cameras, rng), 0
     off_px = []
     for k in range(1500):
@@ -129,9 +130,7 @@ def test_poses_that_drift_are_followed():
             refinement.correct(())
             n_corrections += 1
         left = errors.reshape(-1, ERRORS)
-        off_px.append(
-            np.sqrt(np.einsum("ki,kij,kj->k", left, image_metrics(list(cameras.values())), left)).max()
-        )
+        off_px.append(np.sqrt(np.einsum("ki,kij,kj->k", left, metrics, left)).max())
     assert n_corrections > 3
     assert max(off_px) < 0.25  # of 1.4 px
 

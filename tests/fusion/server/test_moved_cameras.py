@@ -25,10 +25,11 @@ TURNS = [
 ]
 
 
-@pytest.fixture
-def arena(tmp_path: Path) -> Iterator[VirtualArena]:
-    """Four calibrated cameras and ten robots, which are tracked."""
-    with VirtualArena(tmp_path, small_load()) as arena:
+@pytest.fixture(scope="module")
+def arena(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualArena]:
+    """Four calibrated cameras and ten robots, which are tracked. Each test moves cameras of its own, and moves them
+    back."""
+    with VirtualArena(tmp_path_factory.mktemp("arena"), small_load()) as arena:
         arena.wait(3.0)
         yield arena
 
