@@ -3,7 +3,6 @@
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,10 +24,18 @@ from web.tabs.marker_picker import MarkerPicker
 from web.view import View
 
 
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Client]]:
+    """A running arena with an undeclared robot, which only the last test declares."""
+    with serving_an_unknown_robot(tmp_path_factory.mktemp("arena")) as (endpoint, client):
+        yield endpoint, client
+
+
 @pytest.fixture
-def arena(tmp_path: Path) -> Iterator[tuple[Client, View, MarkerPicker]]:
-    """The page of a running arena with an undeclared robot."""
-    with serving_an_unknown_robot(tmp_path) as (endpoint, client), ServerConnection([endpoint]) as connection:
+def arena(served: tuple[str, Client]) -> Iterator[tuple[Client, View, MarkerPicker]]:
+    """Its page."""
+    endpoint, client = served
+    with ServerConnection([endpoint]) as connection:
         subscription = Subscription(connection, Feed("test"))
         make = lambda view: MarkerPicker(view.server, subscription)  # noqa: E731
         with showing(subscription.feed, make) as (view, picker):
@@ -96,6 +103,32 @@ def selects(point: np.ndarray, arena: tuple[Client, View, MarkerPicker], page: P
     return len(picker.selected) > n
 
 
+def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicker]):
+    """No marker selected, which clicks do only after the button; a marker deselected; one that is not there; another
+    diameter; two markers; a bad name."""
+    _, _, picker = arena
+    refused(picker, "no marker")
+    wait_for(lambda: len(picker._unlabeled))
+    above = marker_positions()[0] + [0.0, 0.0, 2.0]
+    picker.select(above, (0.0, 0.0, -1.0))
+    assert picker.selected == []
+    picker._toggle()
+    wait_for(lambda: picker.selected, lambda: picker.select(above, (0.0, 0.0, -1.0)))
+    picker.select(above, (0.0, 0.0, -1.0))
+    assert picker.selected == []
+    picker.select(above, (1.0, 0.0, 0.0))
+    assert picker.selected == [], "there is no marker in this direction"
+    picker.selected = [np.array([0.9, 0.9, 0.1])]
+    refused(picker, "0.90, 0.90, 0.10 m")
+    picker.selected = list(marker_positions())
+    refused(picker, "measure about 120 mm, not 90 mm")
+    picker._diameter.here.value = 120.0
+    picker.selected = list(marker_positions()[:2])
+    refused(picker, "make no robot")
+    picker._name.here.value = "a/b"
+    refused(picker, "'a/b'")
+
+
 def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
     """Select its markers, enter its name; then the server tracks it, with x towards the first selected marker."""
     client, view, picker = arena
@@ -129,32 +162,6 @@ def test_a_robot_is_defined_by_clicks(arena: tuple[Client, View, MarkerPicker]):
     first = WIDE.points[0] - WIDE.points.mean(0)
     assert abs(robot.points[0, 0] - np.linalg.norm(first)) < 2e-3
     assert picker.selected == []
-
-
-def test_an_invalid_definition_is_refused(arena: tuple[Client, View, MarkerPicker]):
-    """No marker selected, which clicks do only after the button; a marker deselected; one that is not there; another
-    diameter; two markers; a bad name."""
-    _, _, picker = arena
-    refused(picker, "no marker")
-    wait_for(lambda: len(picker._unlabeled))
-    above = marker_positions()[0] + [0.0, 0.0, 2.0]
-    picker.select(above, (0.0, 0.0, -1.0))
-    assert picker.selected == []
-    picker._toggle()
-    wait_for(lambda: picker.selected, lambda: picker.select(above, (0.0, 0.0, -1.0)))
-    picker.select(above, (0.0, 0.0, -1.0))
-    assert picker.selected == []
-    picker.select(above, (1.0, 0.0, 0.0))
-    assert picker.selected == [], "there is no marker in this direction"
-    picker.selected = [np.array([0.9, 0.9, 0.1])]
-    refused(picker, "0.90, 0.90, 0.10 m")
-    picker.selected = list(marker_positions())
-    refused(picker, "measure about 120 mm, not 90 mm")
-    picker._diameter.here.value = 120.0
-    picker.selected = list(marker_positions()[:2])
-    refused(picker, "make no robot")
-    picker._name.here.value = "a/b"
-    refused(picker, "'a/b'")
 
 
 def refused(picker: MarkerPicker, reason: str) -> None:
