@@ -68,6 +68,12 @@ class _Clock:
         return math.hypot(self.sigma_s, self.rate_sigma * (self.now_ns - self.since_ns) * 1e-9)
 
     @property
+    def is_off(self) -> bool:
+        """Whether the correction is more than its own uncertainty. A clock from which others departed has none of its
+        own: it takes a part of their rates (`hold_common_rate`)."""
+        return abs(self.at(self.now_ns)) > CERTAIN * self.known_s > 0
+
+    @property
     def health(self) -> ClockHealth:
         offset_s, sigma_s = self.at(self.now_ns), self.known_s
         size_s = max(REPORTED_S, abs(offset_s))
@@ -142,7 +148,7 @@ class CameraClocks:
         name, clock = frame.camera, self._clocks[frame.camera]
         if clock.since_ns or clock.sigma_s:
             correction_s, sigma_s = clock.at(frame.t_ns), math.hypot(frame.clock_sigma_s, clock.known_s)
-            if abs(correction_s - clock.reported_s) > REPORTED_S + abs(clock.reported_s):
+            if clock.is_off and abs(correction_s - clock.reported_s) > REPORTED_S + abs(clock.reported_s):
                 clock.reported_s = correction_s
                 log.warning(
                     "camera %s: its clock drifts from the others by %.0f ppm; its stamps are corrected, now by %.1f ms",

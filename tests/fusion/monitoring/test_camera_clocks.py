@@ -136,6 +136,20 @@ def test_a_rate_that_most_clocks_have_in_common_is_none():
     assert offsets_s == pytest.approx([-1e-4, 0.0, 0.0, 4.7e-3], abs=1e-8)
 
 
+def test_a_clock_from_which_the_others_departed_is_not_named(caplog):
+    """After a jump of three of four, 348 ppm that their offsets left, which were known to 300 ppm, were reported as the
+    drift of the fourth. One that departs by more than is uncertain is named."""
+    clocks = CameraClocks(tuple(LOAD.rig))
+    for k, rate in {0: 3.5e-4, 1: 3.5e-4, 3: 5e-3}.items():
+        clocks.correct(Departure(k, START_NS, 0.0, rate, 1e-4, 3e-4))
+    clocks.hold_common_rate(START_NS)
+    for frame in LOAD.frames(1 / LOAD.hz):
+        later = replace(frame, t_ns=START_NS + 10**10, received_ns=START_NS + 10**10)
+        clocks.observe(later)
+        clocks.admit(later)
+    assert [line.split(":")[0] for line in caplog.messages] == ["camera cam3"]
+
+
 def test_a_drift_that_is_not_measured_any_more_becomes_uncertain():
     """The correction grows by the rate, and its standard deviation by that of the rate."""
     clocks, rest_s = CameraClocks(("cam0", "cam1", "cam2")), 600
