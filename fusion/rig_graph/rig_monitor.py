@@ -401,8 +401,7 @@ class RigMonitor:
             self._departures = self._walk.take_departures()
 
     def _note_shapes(self, verdict: Verdict, measured: Measured | None) -> None:
-        """Use the markers of robots where several windows show them, if no camera may be at fault: the robots were
-        measured wrong."""
+        """Use the markers of robots where windows show them, if no camera may be at fault."""
         best = verdict.fit.hypothesis
         is_of_robots = best.cause in (None, "shape") and not best.cameras and not verdict.size
         if measured is None or not self.refines or self.excluded or not is_of_robots:
