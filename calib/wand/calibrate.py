@@ -458,7 +458,7 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
 def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Adjusted:
     """Adjust poses, clocks and lenses on about `budget` frame sets, after a robust optimization of poses and clocks."""
     start = _build(recording, rough, budget)
-    problem = start.problem.with_free(POSE, *clock_candidates(recording.timing, start.problem))
+    problem = start.problem.with_free(POSE, *clock_candidates(recording.timing))
     state = optimize_robustly(problem, start.observations, start.state)
     # Noise in the rough positions looks like acceleration: the first density makes the motion prior too weak, so the
     # motion absorbs noise and the residuals are too small.

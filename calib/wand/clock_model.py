@@ -39,7 +39,6 @@ from calib.wand.wand_report import ClockJump
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.pose import invert, vector_from_rotation
 
-MIN_DRIFT_S = 2.0  # shorter recordings do not show drift
 # A jump that does not disturb the rig leaves neither: the rejected share of a camera's observations, and its drift,
 # s/s.
 MAX_REJECTED, MAX_DRIFT = 0.1, 5 * CRYSTAL_DRIFT
@@ -60,11 +59,9 @@ class ClockModel:
     drift_sigma: float
 
 
-def clock_candidates(timing: Timing, problem: Problem) -> tuple[tuple[int, ...], ...]:
+def clock_candidates(timing: Timing) -> tuple[tuple[int, ...], ...]:
     """The clock parameters that a recording may show; readout times are added by `with_readout_times`."""
-    if timing.synchronous:
-        return ()
-    return (OFFSET, DRIFT) if np.ptp(problem.knot_s) > MIN_DRIFT_S else (OFFSET,)
+    return () if timing.synchronous else (OFFSET, DRIFT)
 
 
 def choose_clocks(adjusted: Adjusted, timing: Timing) -> ClockModel:

@@ -29,8 +29,7 @@ from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, motion_from, vector_from_rotation
 
-SEPARATED = 0.8  # nine of ten on either side of a time: the share before it less the other one
-HALF = 0.5  # of a camera's contradicting detections, that a second pose must explain
+HALF = 0.5  # of a camera's contradicting detections, by which a motion must explain more of all
 MIRRORS = {"left to right": (True, False), "top to bottom": (False, True), "": (True, True)}
 
 
@@ -157,8 +156,8 @@ def _explain_motion(
     apart = np.linalg.norm(there[:3, 3] - camera[:3, 3])
     turned = np.degrees(np.linalg.norm(vector_from_rotation(there[:3, :3] @ camera[:3, :3].T)))
     t_s, fitting = recording.detections.t_s, rows[np.asarray(inliers, np.intp).ravel()]
-    at_s, separated = _separate(t_s[known & ~gross], t_s[fitting])
-    if not separated:
+    at_s, gain = _find_motion(t_s[known & ~gross], t_s[fitting])
+    if gain < max(MIN_COUNT, HALF * len(rows)):
         return 0, ""
     return len(fitting), (
         f"at {at_s:.1f} s of the recording it moved by {apart:.3f} of the rig's units and turned by {turned:.1f} "
@@ -168,12 +167,16 @@ def _explain_motion(
     )
 
 
-def _separate(first: Array, second: Array) -> tuple[float, bool]:
-    """The time that separates times (n,) from times (m,) best, in either order, and whether it separates nine of
-    ten."""
+def _find_motion(first: Array, second: Array) -> tuple[float, int]:
+    """The time at which a camera most likely changes from one pose to another, in either order, and how many more
+    detections it then explains than one pose alone: where the other pose is said to hold, the first explains none.
+
+    Args:
+        first, second: (n,), (m,) times of the detections that fit either pose, seconds.
+    """
     t_s = np.concatenate([first, second])
     order = np.argsort(t_s, kind="stable")
-    is_first = (order < len(first)).astype(float)
-    before = np.cumsum(is_first) / max(len(first), 1) - np.cumsum(1 - is_first) / len(second)
-    k = int(np.abs(before).argmax())
-    return float(t_s[order[k]]), bool(abs(before[k]) > SEPARATED)
+    until = np.cumsum(np.where(order < len(first), -1, 1))
+    gains = np.maximum(until, until[-1] - until)  # the other pose holds until then, or from then on
+    k = int(gains.argmax())
+    return float(t_s[order[k]]), int(gains[k])

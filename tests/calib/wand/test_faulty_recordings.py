@@ -93,6 +93,15 @@ def test_a_light_with_persistent_reflections(cameras: int):
     assert gaps[0] / gaps[0].max() == pytest.approx(gaps[1] / gaps[1].max(), abs=2e-3)
 
 
+def test_a_run_of_reflections_is_no_motion_of_a_camera():
+    """A second pose fits a run of reflections, but not what the camera sees beside them."""
+    light = Body(diameter_m=0.1)
+    options = {"seconds": 20, "rate_hz": 20, "sigma_px": 0.3, "outliers": 0, "seed": 2}
+    recorded = record(WandScenario(cameras=3, **options, **TOGETHER, **{**PLAIN, "wand": light}))
+    messages = in_runs(in_runs(recorded.messages, 0.1, 10, in_a_mirror), 0.3, 40, nothing, seed=5)
+    assert len(calibrate(recorded.intrinsics, light, messages).names) == 3
+
+
 @pytest.mark.parametrize("rate_hz", [pytest.param(5, marks=pytest.mark.slow), 30])
 def test_webcams_with_rolling_shutter(rate_hz: float):
     """Clock offsets of 300 ms and 200 ppm, timestamp jitter, a readout time of 15 ms, and dropped frames. The rolling
