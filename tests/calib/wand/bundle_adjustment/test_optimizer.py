@@ -206,9 +206,11 @@ def test_the_covariance_of_time_offsets_that_drifts_extrapolate_is_right(seeds: 
     their drifts of up to 40 ppm: the squared Mahalanobis errors of the offsets, over all recordings, are between the
     0.1 % and 99.9 % quantiles of chi-square. With drifts fixed at zero they are 13 to 150 times the mean."""
     squared, degrees = 0.0, 0
-    seen = {"numbered": True, "sized": False, "both_sides": True}
+    plain = WandScenario(
+        cameras=4, seconds=40, rate_hz=15, drift_ppm=80, numbered=True, sized=False, both_sides=True
+    )
     for seed in range(seeds):
-        scenario = WandScenario(cameras=4, seconds=40, rate_hz=15, drift_ppm=80, seed=seed, **seen)
+        scenario = replace(plain, seed=seed)
         recorded, quarter_ns = record_wave(scenario), (EPOCH_S + 10) * 1e9
         early = [m for m in recorded.messages if m.camera in ("cam00", "cam01") or m.t_ns < quarter_ns]
         result = calibrate(recorded.intrinsics, scenario.wand, early)
