@@ -301,7 +301,7 @@ def _fit_half(recording: WandRecording) -> tuple[int, float, float]:
     if len(start.placed) < 2:
         return 0, np.inf, np.inf
     try:
-        state = adjust_coarsely(half.of_cameras(start.placed), RoughRig.of(start), BUDGET).state
+        state = adjust_coarsely(half.of_cameras(start.placed), RoughRig.of(start), BUDGET).adjusted.state
     except CalibrationError:
         return 0, np.inf, np.inf
     rest = recording.select(~fitted).of_cameras(start.placed)
@@ -436,17 +436,18 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
         CalibrationError: the wand's lengths do not fit the observations or the roundels' sizes.
         CameraFault: a camera's lens differs from its file, or its observations contradict those of the others.
     """
-    coarse = adjust_coarsely(recording, rough)
+    solution = adjust_coarsely(recording, rough)
+    coarse = solution.adjusted
     check_lenses(recording.names, coarse)
     check_mirrored(recording.wand, coarse)
-    clocks = choose_clocks(coarse, recording.timing)
-    fine = _prepare_fine(recording, rough, coarse, clocks)
-    solution = _adjust_finely(fine, coarse.inflation)
     try:
-        check_agreement(recording.names, solution.adjusted, solution.observations)
-        if rough.metric:
-            check_sizes(recording.wand, solution.adjusted, solution.observations)
-            check_spacing(recording.wand, solution.adjusted, solution.observations)
+        if not coarse.converged:
+            _check_agreement_and_wand(recording, rough, solution)
+            check_residuals(recording, coarse)
+        clocks = choose_clocks(coarse, recording.timing)
+        fine = _prepare_fine(recording, rough, coarse, clocks)
+        solution = _adjust_finely(fine, coarse.inflation)
+        _check_agreement_and_wand(recording, rough, solution)
         return _validate(recording, solution)
     except CameraFault as fault:
         jump = find_jump(recording.names, solution.adjusted, solution.observations)
@@ -455,7 +456,7 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
         raise CameraFault({jump.camera: jump.sentence()}, fault.certain) from None
 
 
-def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Adjusted:
+def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Solution:
     """Adjust poses, clocks and lenses on about `budget` frame sets, after a robust optimization of poses and clocks."""
     start = _build(recording, rough, budget)
     problem = start.problem.with_free(POSE, *clock_candidates(recording.timing))
@@ -465,7 +466,8 @@ def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COA
     density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.timing.gap_s)
     problem = replace(problem.with_free(problem.free, LENS), density=density)
     observations = with_disc_centres(problem, state, start.observations, recording.wand)
-    return with_readout_times(adjust(problem, observations, state), observations, recording.timing)
+    adjusted = with_readout_times(adjust(problem, observations, state), observations, recording.timing)
+    return Solution(adjusted, observations)
 
 
 def _build(recording: WandRecording, rough: RoughRig, budget: int) -> Estimate:
@@ -503,6 +505,19 @@ def _adjust_finely(fine: Estimate, inflation: float) -> Solution:
     return Solution(adjust(problem, fine.observations, first.state), fine.observations)
 
 
+def _check_agreement_and_wand(recording: WandRecording, rough: RoughRig, solution: Solution) -> None:
+    """Check that the cameras agree, and the wand with its file.
+
+    Raises:
+        CalibrationError: the wand's lengths do not fit the roundels' sizes or the distances between them.
+        CameraFault: as in `check_agreement`.
+    """
+    check_agreement(recording.names, solution.adjusted, solution.observations)
+    if rough.metric:
+        check_sizes(recording.wand, solution.adjusted, solution.observations)
+        check_spacing(recording.wand, solution.adjusted, solution.observations)
+
+
 def check_agreement(names: Sequence[str], adjusted: Adjusted, observations: WandObservations) -> None:
     """Raise CameraFault where most detections of a camera contradict those of the other cameras.
 
@@ -537,9 +552,7 @@ def _validate(recording: WandRecording, solution: Solution) -> Solution:
     if len(measured) > MAX_MEASURED:
         measured = np.isin(np.arange(len(measured)), observations.row)
     corrected = recording.with_centres(observations.row, observations.uv).select(measured)
-    given = triangulated_residuals(corrected, adjusted.state)
-    lenses = [adjusted.state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
-    check_residuals(corrected, given, adjusted.state.cameras, lenses)
+    given = check_residuals(corrected, adjusted)
     residuals = np.full(len(measured), np.nan)
     residuals[measured] = np.linalg.norm(given.pixels, axis=1)
     run = recording.timing.instants(corrected.detections.t_s) // RUN

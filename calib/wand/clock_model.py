@@ -95,7 +95,7 @@ def with_readout_times(adjusted: Adjusted, observations: WandObservations, timin
     They are predicted to first order, and adjusted where that prediction is significant. No camera takes longer to read
     an image than from one to the next: larger values explain something else, such as a clock that jumps.
     """
-    if timing.synchronous:
+    if timing.synchronous or not adjusted.converged:
         return adjusted
     cameras = list(adjusted.problem.estimated_cameras())
     problem = adjusted.problem.with_free(adjusted.problem.free, READOUT)

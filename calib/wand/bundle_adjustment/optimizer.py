@@ -46,6 +46,11 @@ from camera_node.foundation.arrays import Array, Index
 [potrf], [trsm] = get_lapack_funcs(["potrf"]), get_blas_funcs(["trsm"])
 INTERRUPTED = 4.0  # sigmas, over all coordinates: something hit the wand, or frames are missing
 MAX_ITERATIONS, MAX_ROUNDS = 60, 5
+MAX_PROFILED = (
+    20  # Gauss-Newton steps; up to 13 where cameras agree, any number where they contradict each other
+)
+# Of the variance of n parameters: steps that end without convergence, but as short as that, are right.
+MAX_ADDED = 0.1
 START_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-5, 1e-9, 1e6  # the first step is damped by a tenth of the start
 # The last step decreases the cost by less than this share, and this absolute amount.
 ROBUST_TOLERANCE, TOLERANCE, ABSOLUTE_TOLERANCE = 5e-3, 1e-4, 1e-4
@@ -76,7 +81,7 @@ def adjust(
     Each round rejects observations, and interrupts the motion prior, by the statistics of the residuals, and optimizes;
     rounds end where these do not change.
     """
-    state, choice, weights = _optimize_exactly(problem, observations, start, rounds)
+    state, converged, choice, weights = _optimize_exactly(problem, observations, start, rounds)
     inliers = observations.select(choice.observations)
     cameras = profile_motion(linearize(problem, inliers, state, weights))
     adjusted = Adjusted(
@@ -88,6 +93,7 @@ def adjust(
         information=cameras.information,
         scores=cameras.scores,
         background_used=choice.background,
+        converged=converged,
     )
     return replace(adjusted, inflation=inflation_factor(adjusted))
 
@@ -110,9 +116,13 @@ def optimize(problem: Problem, observations: WandObservations, start: State) -> 
 
 def _optimize_exactly(
     problem: Problem, observations: WandObservations, state: State, rounds: int
-) -> tuple[State, Choice, Weights]:
-    """The optimal state, what it is adjusted to, and the weights of that, in rounds; where the motion can't be profiled
-    out at once, from the common optimum of cameras and motion, which is reached from farther away."""
+) -> tuple[State, bool, Choice, Weights]:
+    """The optimal state, whether it is one, what it is adjusted to, and the weights of that, in rounds.
+
+    Where the motion can't be profiled out at once, it is from the common optimum of cameras and motion, which is
+    reached from farther away. Where it can't from there, the motion reconciles cameras that contradict each other: no
+    further round would change that, and the common optimum is returned.
+    """
     none = np.zeros(len(observations), bool)
     choice = Choice(none, np.zeros(len(problem.knot_s) - 1, bool), np.zeros(len(problem.background.uv), bool))
     for _ in range(rounds):
@@ -127,10 +137,12 @@ def _optimize_exactly(
         if found is None:
             state, _ = _levenberg_marquardt(objective, state)
             found = _profile(objective, state)
-        state = state if found is None else found
+            if found is None:
+                return state, False, choice, weights.select(choice)
+        state = found
     else:
         weights = find_weights(problem, observations, state)
-    return state, choice, weights.select(choice)
+    return state, True, choice, weights.select(choice)
 
 
 def _choose(
@@ -225,11 +237,13 @@ def _profile(objective: _Objective, state: State) -> State | None:
     and alternate, so the motion is optimized before each. It follows the cameras as damped as it was optimized: a knot
     that the observations hardly determine would move by metres, and all steps would be cut for it. Steps end where
     those that remain, a geometric series of r standard deviations together, add less to the squared error than anyone
-    knows of it: n residuals give a variance to (2 / n)^1/2 of itself.
+    knows of it: n residuals give a variance to (2 / n)^1/2 of itself. Where observations are few or stamps uncertain,
+    steps may alternate at a length that hardly adds to it.
     """
     path = replace(objective, problem=replace(objective.problem, estimated=()))
     most, before, damping = len(objective.observations) ** -0.25, 1.0, START_DAMPING  # two residuals each
-    for _ in range(MAX_ITERATIONS):
+    allowed, is_near = MAX_ADDED * len(objective.problem.estimated_rows()), False
+    for _ in range(MAX_PROFILED):
         try:
             state, damping = _levenberg_marquardt(path, state, damping)
             norms = objective.norms(state)
@@ -240,8 +254,8 @@ def _profile(objective: _Objective, state: State) -> State | None:
         stepped = _step_profiled(objective, state, norms, steps[:2])
         if stepped is None or steps[2] ** 2 < most * (before - steps[2]):
             return stepped
-        state, before = stepped, min(steps[2], 1.0)
-    return None
+        state, before, is_near = stepped, min(steps[2], 1.0), steps[2] ** 2 < allowed
+    return state if is_near else None
 
 
 def _step_profiled(

@@ -292,6 +292,7 @@ class Adjusted:
             space is the gauge: the choice of the world, and of the time that clocks are relative to.
         scores: (L + J, S d) gradients by interval between knots, then by background point, without priors.
         background_used: images of background points that were not rejected.
+        converged: whether the motion could be profiled out: it can't where the cameras contradict each other.
         inflation: factor of the covariance for residuals that are correlated in time.
     """
 
@@ -303,6 +304,7 @@ class Adjusted:
     information: Array
     scores: Array
     background_used: Mask
+    converged: bool = True
     inflation: float = 1.0
 
 

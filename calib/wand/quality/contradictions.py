@@ -6,8 +6,6 @@ the lenses (Bayes factor) or by a wand whose markers are not in a plane; or a ca
 fits what the first one leaves.
 """
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 
@@ -23,6 +21,7 @@ from calib.wand.quality.checks import (
     MIN_COUNT,
     MIN_SHARE,
     TriangulatedResiduals,
+    triangulated_residuals,
 )
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
@@ -88,45 +87,50 @@ def _is_mirrored_body(wand: Body, adjusted: Adjusted) -> bool:
     return bool(np.mean(volume * given < 0) > HALF)
 
 
-def check_residuals(
-    recording: WandRecording, residuals: TriangulatedResiduals, cameras: Array, lenses: Sequence[Lens]
-) -> None:
+def check_residuals(recording: WandRecording, adjusted: Adjusted) -> TriangulatedResiduals:
     """Refuse a rig that the recording contradicts.
 
     Args:
         recording: detections of C cameras.
-        residuals: of the detections, at the adjusted rig.
-        cameras: (C, 4, 4) T_world_cam.
-        lenses: adjusted, of the cameras.
+        adjusted: the rig.
+
+    Returns:
+        The residuals of the detections.
 
     Raises:
         CameraFault: a camera moved during the recording.
-        CalibrationError: most of the detections contradict the rig, or by more than any noise.
+        CalibrationError: most of the detections contradict the rig, or by more than any noise, or the adjustment did
+            not converge.
     """
+    state = adjusted.state
+    residuals = triangulated_residuals(recording, state)
+    lenses = [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
     off = np.linalg.norm(residuals.pixels, axis=1)
     known = np.isfinite(off)
     if not known.any():
-        return
+        return residuals
     usual = max(coordinate_sigma(off[known]), MIN_SIGMA_PX)
     gross = known & (off > GROSS * usual)
     moved: list[tuple[int, str, str]] = []
     for k, lens in enumerate(lenses):
         mine = recording.detections.camera == k
         explained, sentence = _explain_motion(
-            recording, residuals.points, mine & known, mine & gross, cameras[k], lens
+            recording, residuals.points, mine & known, mine & gross, state.cameras[k], lens
         )
         moved.append((explained, recording.names[k], sentence))
     # A camera that moved makes others look wrong: only the one whose motion explains most is named.
     if (most := max(moved))[0]:
         raise CameraFault({most[1]: most[2]})
     size = max(max(lens.width, lens.height) for lens in lenses)
-    if usual > GATE * size or gross.sum() > HALF * known.sum():
+    if not adjusted.converged or usual > GATE * size or gross.sum() > HALF * known.sum():
         raise CalibrationError(
             f"the recording contradicts every rig that was found: half of the detections are {usual:.3g} px or more "
-            f"from where the other cameras see them, and {gross.sum() / known.sum():.0%} are gross errors; no camera "
-            "that moved, no clock, mirrored image or exchanged camera explains it. Calibrate pairs of cameras (leave "
-            "the others out of the recording) to find the one that contradicts"
+            f"from where the other cameras see them, and {gross.sum() / known.sum():.0%} are gross errors; no single "
+            "camera that moved, no clock, mirrored image or exchanged camera explains it. In case several cameras "
+            "moved, calibrate the first and the second half of the recording on their own (roundel trim); then pairs "
+            "of cameras (leave the others out) to find the ones that contradict"
         )
+    return residuals
 
 
 def _explain_motion(

@@ -115,11 +115,10 @@ def test_a_camera_that_moves_is_named_with_the_time():
     assert float(at[2]) == pytest.approx(0.3 * 2**0.5, rel=0.1)
 
 
-@pytest.mark.slow
 def test_cameras_that_contradict_each_other_are_refused():
     """Two of four move: nothing is written. The first half of the recording is calibrated, as the message says."""
     arena = ring()
     messages = moved_half_way(arena, {"cam2": (0.0, 0.3, -0.3), "cam3": (0.3, 0.0, 0.2)})
-    with pytest.raises(CalibrationError, match=r"contradict each other: .* it moved by"):
+    with pytest.raises(CalibrationError, match=r"contradicts every rig .* second half of the recording"):
         calibrate(arena.intrinsics, WAND, messages)
     assert len(calibrate(arena.intrinsics, WAND, [m for m in messages if m.seq < 80]).names) == 4
