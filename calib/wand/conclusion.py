@@ -15,7 +15,7 @@ from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_cov
 from calib.wand.bundle_adjustment.problem import Adjusted, WandObservations, gauge_directions
 from calib.wand.bundle_adjustment.residuals import point_residuals
 from calib.wand.detections import WandRecording
-from calib.wand.quality.checks import measure_lengths
+from calib.wand.quality.checks import Spacing, measure_lengths
 from calib.wand.quality.lenses import find_lens_changes
 from calib.wand.scale import Distance, DistanceComparison
 from calib.wand.wand_report import (
@@ -45,6 +45,7 @@ class Solution:
         held_out: residuals of a fifth of the instants, at the rig adjusted without these.
         rejected_px: (r,) distances of the rejected observations from where the other cameras see the marker, pixels;
             NaN where none does.
+        spacing: of the wand, where the cameras measure it otherwise than its file has it.
     """
 
     adjusted: Adjusted
@@ -52,6 +53,7 @@ class Solution:
     given: Validation | None = None
     held_out: Validation | None = None
     rejected_px: Array | None = None
+    spacing: Spacing | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,9 @@ def conclude(rig: Rig, solution: Solution, placement: Placement, jump: ClockJump
     """Build the result: the rig in an upright world, clocks relative to their median, and the report."""
     adjusted, observations = solution.adjusted, solution.observations
     if placement.scaled_by is not None:
-        adjusted = add_scale_uncertainty(adjusted, placement.scaled_by)
+        adjusted = add_scale_uncertainty(adjusted, placement.scaled_by.sigma_m / placement.scaled_by.metres)
+    elif solution.spacing is not None:  # any of its distances may be the one that is wrong
+        adjusted = add_scale_uncertainty(adjusted, solution.spacing.error)
     covariance = camera_covariance(adjusted)
     offsets, drift, readout = (adjusted.state.clocks * CLOCK_UNITS).T
     variances = np.einsum("cpcp->cp", covariance.of((*OFFSET, *DRIFT, *READOUT)))
@@ -209,6 +213,7 @@ def _build_report(solution: Solution, covariance: CameraCovariance, placement: P
         scaled_by=placement.scaled_by,
         compared=compare_distance(distance, names, adjusted) if distance else None,
         timing=placement.timing,
+        wand=solution.spacing.sentence() if solution.spacing else "",
         adjusted_lenses={
             name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
         },
@@ -283,14 +288,14 @@ def compare_distance(
     return DistanceComparison(distance, length, float(np.sqrt(J @ cov @ J + distance.sigma_m**2)))
 
 
-def add_scale_uncertainty(adjusted: Adjusted, distance: Distance) -> Adjusted:
-    """Add the uncertainty of the distance that gave the scale, which the adjustment took as exact.
+def add_scale_uncertainty(adjusted: Adjusted, sigma: float) -> Adjusted:
+    """Add the uncertainty of the length that gave the scale, which the adjustment took as exact.
 
-    The covariance S becomes S + s^2 g g', for the relative standard deviation s of the distance and the derivative g of
-    the cameras by the scale of the world, without its component along the gauge. In the information matrix this is a
-    downdate of rank one (Sherman and Morrison).
+    The covariance S becomes S + s^2 g g', for the relative standard deviation s = `sigma` of the length and the
+    derivative g of the cameras by the scale of the world, without its component along the gauge. In the information
+    matrix this is a downdate of rank one (Sherman and Morrison).
     """
-    relative = distance.sigma_m / distance.metres / (adjusted.scale * adjusted.inflation**0.5)
+    relative = sigma / (adjusted.scale * adjusted.inflation**0.5)
     if relative == 0:
         return adjusted
     free, cameras = adjusted.problem.free, adjusted.state.cameras

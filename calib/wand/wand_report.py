@@ -161,6 +161,7 @@ class WandReport:
         scaled_by: the measured distance that gives the scale.
         compared: a measured distance compared with the wand.
         timing: whether the cameras are taken as synchronous, and why.
+        wand: how the wand, as the cameras measure it, differs from its file; empty where it does not.
         adjusted_lenses: the change of each lens by the adjustment, as `rig.yaml` has it.
         exchanges: cameras under whose names there are points of others; these were left out.
         background: the points beside the wand, if any are given.
@@ -179,6 +180,7 @@ class WandReport:
     scaled_by: Distance | None
     compared: DistanceComparison | None
     timing: str
+    wand: str
     adjusted_lenses: dict[str, Any]
     exchanges: list[Exchange]
     background: BackgroundReport | None = None
@@ -198,6 +200,7 @@ class WandReport:
         return {
             "metric": self.metric,
             "timing": self.timing,
+            **({"wand": self.wand} if self.wand else {}),
             "wand_poses": self.wand_poses,
             "residual_px": round(self.residual_px, 4),
             **self._validation(),

@@ -16,7 +16,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
+import msgspec
 import numpy as np
+from scipy.optimize import least_squares
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, lens_parameters
@@ -33,7 +35,12 @@ from camera_node.geometry.lens import Lens
 
 # Of the distance, by sizes: what tone curves and dot gain leave of them; 2 % in the first seconds of a camera.
 MAX_SIZE_ERROR = 0.04
-MAX_SPACING_ERROR = 0.03  # of the wand's length: the error of any distance between its markers is below it
+# Of the wand's length: an error of a distance between its markers that displaces cameras beyond what is claimed, and
+# one from which it is not known which distance is right.
+MIN_SPACING_ERROR, MAX_SPACING_ERROR = 0.002, 0.03
+EXACT_M = 1e-6  # the least standard deviation of a distance
+FLAT = 1e-6  # of a wand's longest axis: it has no extent along this one
+MEDIAN_DEVIATION = 0.6745  # standard deviations
 MIN_MEASURED = 8  # frame sets at which a distance is measured
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
@@ -95,28 +102,81 @@ def check_motion(detections: WandDetections, names: Sequence[str], lenses: Seque
         )
 
 
-def check_spacing(wand: Body, adjusted: Adjusted, observations: WandObservations) -> None:
-    """Raise CalibrationError where the cameras measure other distances between the wand's markers than its file has."""
+@dataclass(frozen=True, slots=True)
+class Spacing:
+    """Distances between the markers of a wand, metres.
+
+    Attributes:
+        pairs: (P, 2) of markers.
+        given: (P,) by the wand's file.
+        found, sigma: (P,) as the cameras measure them, and standard deviations; the largest is as in the file.
+    """
+
+    pairs: Index
+    given: Array
+    found: Array
+    sigma: Array
+
+    def sentence(self) -> str:
+        """The distance that is off by the largest share."""
+        worst, largest = int(np.abs(np.log(self.found / self.given)).argmax()), int(self.given.argmax())
+        (a, b), (c, d) = self.pairs[worst].tolist(), self.pairs[largest].tolist()
+        return (
+            f"the wand differs from its file: markers {a} and {b} are {self.given[worst]:.4f} m apart there, and "
+            f"{self.found[worst]:.4f} m as the cameras measure it, if {c} and {d} are {self.given[largest]:.4f} m apart"
+        )
+
+    @property
+    def error(self) -> float:
+        """The largest difference, as a share of the largest distance."""
+        return float(np.abs(self.found - self.given).max() / self.given.max())
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether noise explains the differences."""
+        return bool((np.abs(self.found - self.given) < GROSS * self.sigma).all())
+
+    def correct(self, wand: Body) -> Body:
+        """The wand with its markers at these distances, as near to their places in the file as these allow; markers in
+        a line or in a plane stay there, as the cameras may not show more."""
+        (first, second), count = self.pairs.T, len(wand.markers)
+        _, sizes, axes = np.linalg.svd(wand.points - wand.points.mean(axis=0))
+        axes = axes[: np.count_nonzero(sizes > FLAT * sizes[0])]
+
+        def residuals(off: Array) -> Array:
+            points = wand.points + off.reshape(count, -1) @ axes
+            lengths = np.linalg.norm(points[first] - points[second], axis=1)
+            return np.concatenate(
+                [(lengths - self.found) / self.sigma, off / (MAX_SPACING_ERROR * self.given.max())]
+            )
+
+        off = least_squares(residuals, np.zeros(count * len(axes))).x.reshape(count, -1)
+        return msgspec.structs.replace(wand, markers=tuple(map(tuple, (wand.points + off @ axes).tolist())))
+
+
+def measure_spacing(wand: Body, adjusted: Adjusted, observations: WandObservations) -> Spacing | None:
+    """The distances between the markers that are farthest apart and all others; None where fewer than two are known."""
     # A marker at a wrong place is at wrong distances from the markers that are farthest apart: their number counts.
     basis = adjusted.problem.wand.basis.tolist()
     pairs = np.array(
         sorted({(min(a, b), max(a, b)) for a in basis for b in range(len(wand.markers)) if a != b})
     )
     if len(pairs) < 2:
-        return
+        return None
     given = _pair_distances(wand.points[None], pairs)[0]
-    measured = _pair_distances(triangulate_markers(adjusted, observations), pairs)
-    known = np.isfinite(measured).sum(axis=0) >= MIN_MEASURED
-    if not known.any():
-        return
-    found = np.nanmedian(measured[:, known], axis=0)
-    worst = int(np.abs(found - given[known]).argmax())
-    if abs(found[worst] - given[known][worst]) > MAX_SPACING_ERROR * given.max():
-        a, b = pairs[known][worst]
-        raise CalibrationError(
-            f"the wand differs from its file: markers {a} and {b} are {given[known][worst]:.3f} m apart there, and "
-            f"{found[worst]:.3f} m as the cameras measure it; measure the wand again"
-        )
+    # A wrong file makes all observations of a marker outliers.
+    every = np.ones(len(observations), bool)
+    measured = _pair_distances(triangulate_markers(adjusted, observations, every), pairs)
+    count = np.isfinite(measured).sum(axis=0)
+    known = count >= MIN_MEASURED
+    if known.sum() < 2:
+        return None
+    pairs, given, measured = pairs[known], given[known], measured[:, known]
+    found = np.nanmedian(measured, axis=0)
+    spread = np.nanmedian(np.abs(measured - found), axis=0) / MEDIAN_DEVIATION
+    scale = given.max() / found[given.argmax()]
+    sigma = np.maximum(spread * np.sqrt(np.pi / 2 / count[known]), EXACT_M)  # of a median
+    return Spacing(pairs, given, scale * found, scale * sigma)
 
 
 def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) -> None:
@@ -137,13 +197,13 @@ def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) 
     )
 
 
-def triangulate_markers(adjusted: Adjusted, observations: WandObservations) -> Array:
-    """(K, M, 3) positions of the wand's markers by the cameras alone, world; NaN where fewer than two cameras saw one,
-    or their rays are parallel.
+def triangulate_markers(adjusted: Adjusted, observations: WandObservations, chosen: Mask) -> Array:
+    """(K, M, 3) positions of the wand's markers by chosen (n,) observations alone, world; NaN where fewer than two
+    cameras saw one, or their rays are parallel.
 
     One Gauss-Newton step of every marker of a frame set from its adjusted position, without the wand's lengths.
     """
-    state, problem, rows = adjusted.state, adjusted.problem, np.flatnonzero(adjusted.used)
+    state, problem, rows = adjusted.state, adjusted.problem, np.flatnonzero(chosen)
     markers = np.einsum("mb,kbx->kmx", problem.wand.weights, state.motion[:, 0])
     camera, k, m = observations.camera[rows], observations.knot[rows], observations.label[rows]
     lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
@@ -163,7 +223,7 @@ def triangulate_markers(adjusted: Adjusted, observations: WandObservations) -> A
 def measure_lengths(adjusted: Adjusted, observations: WandObservations) -> Array:
     """(n,) errors of the wand's lengths as the cameras alone measure them, metres."""
     wand = adjusted.problem.wand
-    markers = triangulate_markers(adjusted, observations)
+    markers = triangulate_markers(adjusted, observations, adjusted.used)
     errors = _pair_distances(markers[:, wand.basis], wand.pairs) - wand.lengths
     return errors[np.isfinite(errors)]
 

@@ -4,10 +4,14 @@
 import re
 
 import msgspec
+import numpy as np
 import pytest
 
 from calib.errors import CalibrationError
 from calib.wand.calibrate import calibrate
+from calib.wand.wand_report import WandCalibration
+from camera_node.foundation.arrays import Array
+from camera_node.geometry.body import Body
 from tests.calib.synthetic import WAND, Arena, record, ring
 
 STICK_WITH_ROUNDELS = msgspec.structs.replace(WAND, markers=((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
@@ -20,20 +24,71 @@ def test_a_wand_at_rest_is_refused():
 
 
 def test_a_wand_file_with_a_wrong_spacing_is_refused():
-    """The middle marker is 3 cm off in the file: the message has the distance of the file and the measured one. With
-    6 cm, no two cameras fit."""
+    """The middle marker is 3 cm off in the file: the message has the distance of the file and the measured one, by
+    0.2 mm, which is four of its standard deviations. With 6 cm, no two cameras fit."""
     arena = ring(4)
     wrong = msgspec.structs.replace(WAND, markers=((0.0, 0.0, 0.0), (0.17, 0.0, 0.0), (0.5, 0.0, 0.0)))
     messages = record(arena, 8.0, sigma_px=0.1, sized=False, numbered=True)
-    with pytest.raises(CalibrationError, match=r"markers 0 and 1 .*0\.170 m") as caught:
+    with pytest.raises(CalibrationError, match=r"markers 0 and 1 .*0\.1700 m") as caught:
         calibrate(arena.intrinsics, wrong, messages)
-    lengths = [float(length) for length in re.findall(r"(\d\.\d{3}) m", str(caught.value))]
-    assert lengths == [0.17, pytest.approx(0.2, abs=0.01)]  # scale and spacing share the error
+    lengths = [float(length) for length in re.findall(r"(\d\.\d{4}) m", str(caught.value))]
+    assert lengths == [0.17, pytest.approx(0.2, abs=2e-4), 0.5]
     far_off = msgspec.structs.replace(WAND, markers=((0.0, 0.0, 0.0), (0.14, 0.0, 0.0), (0.5, 0.0, 0.0)))
     with pytest.raises(
         CalibrationError, match=r"'cam\d' and 'cam\d' .* in \d+ frame sets.* measure the wand"
     ):
         calibrate(arena.intrinsics, far_off, messages)
+
+
+ANGLE = Body(diameter_m=0.1, markers=((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.1, 0.25, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("wand", "file"),
+    [
+        (WAND, ((0.0, 0.0, 0.0), (0.197, 0.0, 0.0), (0.5, 0.0, 0.0))),
+        (WAND, ((0.0, 0.0, 0.0), (0.19, 0.0, 0.0), (0.5, 0.0, 0.0))),
+        pytest.param(ANGLE, ((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.1, 0.254, 0.0)), marks=pytest.mark.slow),
+        pytest.param(ANGLE, ((0.0, 0.0, 0.0), (0.404, 0.0, 0.0), (0.1, 0.25, 0.0)), marks=pytest.mark.slow),
+    ],
+)
+def test_a_wand_that_was_measured_wrong_is_measured_by_the_cameras(
+    wand: Body, file: tuple[tuple[float, float, float], ...]
+):
+    """By 3, 10 and 4 mm: cameras were displaced by 13 to 180 mm. Their arrangement is as exact as with the true wand,
+    up to its size, which is as uncertain as the wand."""
+    arena = ring(4, wand=wand)
+    messages = record(arena, 8.0, sigma_px=0.1, sized=False, numbered=True)
+    results = [
+        calibrate(arena.intrinsics, given, messages)
+        for given in (wand, msgspec.structs.replace(wand, markers=file))
+    ]
+    assert not results[0].report.wand
+    assert re.match(
+        "the wand differs from its file: markers .* as the cameras measure it", results[1].report.wand
+    )
+    truth = np.array([camera.matrix()[:3, 3] for camera in arena.truth.cameras.values()])
+    off_mm = []
+    for result in results:
+        found = np.array([camera.matrix()[:3, 3] for camera in result.rig.cameras.values()])
+        sizes = [np.linalg.norm(points - points.mean(axis=0)) for points in (found, truth)]
+        off_mm.append(1e3 * apart(found * sizes[1] / sizes[0], truth))
+        assert abs(sizes[0] / sizes[1] - 1) < 4 * np.sqrt(size_variance(result))
+    assert off_mm[1] < off_mm[0] + 0.5  # 0.1 px are 0.4 mm at 2 m
+
+
+def apart(first: Array, second: Array) -> float:
+    """The largest difference of the distances between the points of either set."""
+    gaps = [np.linalg.norm(points[:, None] - points, axis=2) for points in (first, second)]
+    return float(np.abs(gaps[0] - gaps[1]).max())
+
+
+def size_variance(result: WandCalibration) -> float:
+    """Of the size of a rig, as a share of it."""
+    T = [camera.matrix() for camera in result.rig.cameras.values()]
+    centre = np.mean([pose[:3, 3] for pose in T], axis=0)
+    g = np.concatenate([np.append(np.zeros(3), pose[:3, :3].T @ (pose[:3, 3] - centre)) for pose in T])
+    return float(g @ result.covariance @ g / (g @ g) ** 2)
 
 
 @pytest.mark.parametrize("sigma_px", [pytest.param(0.1, marks=pytest.mark.slow), 0.4])
