@@ -57,6 +57,7 @@ from calib.wand.quality.checks import (
     check_sizes,
     find_exchanges,
     measure_spacing,
+    sum_squares,
     triangulated_residuals,
 )
 from calib.wand.quality.contradictions import check_mirrored, check_residuals
@@ -464,22 +465,29 @@ def _measure_wand(recording: WandRecording, rough: RoughRig) -> tuple[WandRecord
 
     The adjustment displaces cameras to reconcile them with a wand that was measured wrong: 5 mm of 0.5 m are 0.1 m. The
     largest distance between two markers stays as in the file: it is the scale. Each adjustment leaves about a fifth of
-    the error.
+    the error; one that explains the recording no better has measured something else.
 
     Raises:
         CalibrationError: the wand differs so much that it is not known which of its distances is right.
     """
-    file, solution = recording.wand, adjust_coarsely(recording, rough)
-    spacing = measure_spacing(file, solution.adjusted, solution.observations) if rough.metric else None
+    solution = adjust_coarsely(recording, rough)
+    spacing = (
+        measure_spacing(recording.wand, solution.adjusted, solution.observations) if rough.metric else None
+    )
     if spacing is None or spacing.is_explained or spacing.error < MIN_SPACING_ERROR:
         return recording, solution
+    measured, found, misfit = recording, spacing, sum_squares(solution.adjusted, solution.observations)
     for _ in range(WANDS):
-        recording = replace(recording, wand=spacing.correct(file))
-        solution = adjust_coarsely(recording, rough)
-        spacing = measure_spacing(file, solution.adjusted, solution.observations) or spacing
-    if spacing.error > MAX_SPACING_ERROR:
-        raise CalibrationError(f"{spacing.sentence()}; measure the wand again")
-    return recording, replace(solution, spacing=spacing)
+        other = replace(recording, wand=found.correct(recording.wand))
+        trial = adjust_coarsely(other, rough)
+        if (better := sum_squares(trial.adjusted, trial.observations)) > misfit:
+            break
+        measured, misfit = other, better
+        found = measure_spacing(recording.wand, trial.adjusted, trial.observations) or found
+        solution = replace(trial, spacing=found)
+    if solution.spacing is not None and found.error > MAX_SPACING_ERROR:
+        raise CalibrationError(f"{found.sentence()}; measure the wand again")
+    return measured, solution
 
 
 def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Solution:

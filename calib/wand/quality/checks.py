@@ -19,6 +19,7 @@ from itertools import combinations
 import msgspec
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.special import stdtrit
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, lens_parameters
@@ -40,7 +41,7 @@ MAX_SIZE_ERROR = 0.04
 MIN_SPACING_ERROR, MAX_SPACING_ERROR = 0.002, 0.03
 EXACT_M = 1e-6  # the least standard deviation of a distance
 FLAT = 1e-6  # of a wand's longest axis: it has no extent along this one
-MEDIAN_DEVIATION = 0.6745  # standard deviations
+MEDIAN_DEVIATION, MEDIAN_EFFICIENCY = 0.6745, 0.37  # in standard deviations, and against theirs
 MIN_MEASURED = 8  # frame sets at which a distance is measured
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
@@ -110,12 +111,14 @@ class Spacing:
         pairs: (P, 2) of markers.
         given: (P,) by the wand's file.
         found, sigma: (P,) as the cameras measure them, and standard deviations; the largest is as in the file.
+        count: (P,) frame sets that they were measured in.
     """
 
     pairs: Index
     given: Array
     found: Array
     sigma: Array
+    count: Index
 
     def sentence(self) -> str:
         """The distance that is off by the largest share."""
@@ -133,8 +136,10 @@ class Spacing:
 
     @property
     def is_explained(self) -> bool:
-        """Whether noise explains the differences."""
-        return bool((np.abs(self.found - self.given) < GROSS * self.sigma).all())
+        """Whether noise explains the differences: Student's test, with as many degrees of freedom as a median deviation
+        of `count` has by its efficiency (Rousseeuw and Croux 1993)."""
+        limit = -stdtrit(MEDIAN_EFFICIENCY * (self.count - 1), CHANCE / (2 * len(self.count)))
+        return bool((np.abs(self.found - self.given) < limit * self.sigma).all())
 
     def correct(self, wand: Body) -> Body:
         """The wand with its markers at these distances, as near to their places in the file as these allow; markers in
@@ -176,7 +181,14 @@ def measure_spacing(wand: Body, adjusted: Adjusted, observations: WandObservatio
     spread = np.nanmedian(np.abs(measured - found), axis=0) / MEDIAN_DEVIATION
     scale = given.max() / found[given.argmax()]
     sigma = np.maximum(spread * np.sqrt(np.pi / 2 / count[known]), EXACT_M)  # of a median
-    return Spacing(pairs, given, scale * found, scale * sigma)
+    return Spacing(pairs, given, scale * found, scale * sigma, count[known])
+
+
+def sum_squares(adjusted: Adjusted, observations: WandObservations) -> float:
+    """The sum of all squared residuals in their assumed standard deviations, each as a gross error at most."""
+    residuals = adjusted.residuals
+    squares = np.einsum("ni,nij,nj->n", residuals, np.linalg.inv(observations.cov), residuals)
+    return float(np.fmin(squares, GROSS**2).sum())
 
 
 def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) -> None:
