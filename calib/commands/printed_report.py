@@ -105,11 +105,6 @@ def _remarks(report: WandReport) -> list[str]:
             f"measured less given wand length: mean {report.length_mean_mm:+.2f} mm, "
             f"standard deviation {report.length_std_mm:.2f} mm"
         )
-    if report.wand:
-        lines.append(
-            f"warning: {report.wand}; the measured distances were used, and the last one gives the size of the rig: "
-            "measure both again, and correct the wand file"
-        )
     lines += _scale_remarks(report)
     if report.background is not None:
         lines.append(report.background.sentence())

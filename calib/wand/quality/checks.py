@@ -179,9 +179,11 @@ def measure_spacing(wand: Body, adjusted: Adjusted, observations: WandObservatio
     pairs, given, measured = pairs[known], given[known], measured[:, known]
     found = np.nanmedian(measured, axis=0)
     spread = np.nanmedian(np.abs(measured - found), axis=0) / MEDIAN_DEVIATION
-    scale = given.max() / found[given.argmax()]
     sigma = np.maximum(spread * np.sqrt(np.pi / 2 / count[known]), EXACT_M)  # of a median
-    return Spacing(pairs, given, scale * found, scale * sigma, count[known])
+    longest = given.argmax()
+    share = found / found[longest]
+    sigma = np.hypot(sigma, share * sigma[longest]) * given[longest] / found[longest]
+    return Spacing(pairs, given, share * given[longest], sigma, count[known])
 
 
 def sum_squares(adjusted: Adjusted, observations: WandObservations) -> float:

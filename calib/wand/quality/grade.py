@@ -115,6 +115,7 @@ class RigQuality:
         expected: predicted errors of points at the height of robots' roundels; None for a rig without scale.
         held_out: residuals of held-out detections; None where they could not be measured.
         open_lenses: 95 % interval of each focal length that the recording does not determine, pixels, by camera.
+        wand: how the wand differs from its file, with what to do; empty where it does not.
     """
 
     cameras: list[CameraQuality]
@@ -123,6 +124,7 @@ class RigQuality:
     expected: PrecisionMap | None
     held_out: Validation | None = None
     open_lenses: dict[str, tuple[float, float]] = field(default_factory=dict)
+    wand: str = ""
 
     @property
     def grade(self) -> str:
@@ -139,8 +141,8 @@ class RigQuality:
 
     def sentence(self) -> str:
         """State the grade, its cause and the remedy, and what is not determined."""
-        open_lenses = describe_open_lenses(self.open_lenses)
-        return f"{self._reason()}; {open_lenses}" if open_lenses else self._reason()
+        parts = (self._reason(), describe_open_lenses(self.open_lenses), self.wand)
+        return "; ".join(part for part in parts if part)
 
     def _reason(self) -> str:
         worst = max(self.cameras, key=lambda camera: _severity(camera.worst, camera.figures[camera.worst]))
@@ -244,7 +246,9 @@ def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQua
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
     expected = _predict(result, positions, covariance, height_m) if result.report.metric else None
     open_lenses = find_open_lenses(find_lens_changes(result.names, result.adjusted))
-    return RigQuality(cameras, unplaced, error, expected, result.report.held_out, open_lenses)
+    differs = f"{result.report.wand}; this was used: measure both again, and correct the wand file"
+    described = differs if result.report.wand else ""
+    return RigQuality(cameras, unplaced, error, expected, result.report.held_out, open_lenses, described)
 
 
 def wand_positions(result: WandCalibration) -> Array:
