@@ -46,6 +46,7 @@ class RobotShapes:
     def __init__(self, markers: MarkerTable) -> None:
         self._markers, self._declared = markers, markers.position.copy()
         self._known: dict[int, Shape] = {}
+        self._placed: set[int] = set()  # robots whose markers are not used where they are declared
 
     @property
     def displaced_m(self) -> dict[int, float]:
@@ -56,6 +57,7 @@ class RobotShapes:
     def inherit(self, old: "RobotShapes", same: Mapping[int, int]) -> None:
         """Continue with the robots of another one, whose rows `same` has by row."""
         self._known = {row: old._known[k] for row, k in same.items() if k in old._known}
+        self._placed = {row for row, k in same.items() if k in old._placed}
 
     def forget(self) -> None:
         """Forget the windows: they were judged by other cameras. The places in use stay."""
@@ -68,10 +70,16 @@ class RobotShapes:
         return {robot: self._learned(robot, *window) for robot, window in windows.items()}
 
     def use(self, shapes: Mapping[int, Shape]) -> bool:
-        """Use these shapes of robots; whether a marker is elsewhere by more than the tolerance from now on."""
+        """Use these shapes of robots; whether a marker is elsewhere by more than the tolerance from now on.
+
+        Robots within the tolerance stay as declared, which their claims contain: a live server judges later than a
+        replay, and both have the same poses.
+        """
         before = self._markers.position.copy()
         for robot, shape in shapes.items():
-            self._markers.place(robot, self._places(robot) + shape.off, shape.frame)
+            if robot in self._placed or np.linalg.norm(shape.off, axis=1).max() > PLACE_M:
+                self._placed.add(robot)
+                self._markers.place(robot, self._places(robot) + shape.off, shape.frame)
         self._known |= shapes
         return bool(np.linalg.norm(self._markers.position - before, axis=0).max(initial=0.0) > PLACE_M)
 
