@@ -15,6 +15,7 @@ GROSS = 4.5  # standard deviations of a distance in the image: one true one in 2
 # Least difference of the squared Mahalanobis distances of two hypotheses, one of which is chosen: odds of 400.
 MARGIN = 12.0
 CAUCHY_SCALE = 2.3849  # standard deviations, of Cauchy's kernel: 95 % efficient on normal residuals
+MEDIAN_DEVIATION = 0.6745  # standard deviations of a normal distribution: half of it is nearer to its mean
 STEPS = 10  # of Gauss-Newton at the most: from a start nearby, each doubles the number of right digits
 
 

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from calib.rig.coverage import spread_evenly
-from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_weights
+from calib.rig.estimation import CAUCHY_SCALE, MEDIAN_DEVIATION, STEPS, cauchy_weights
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.covariance import FOCAL, calibrated_sigma
 from calib.wand.bundle_adjustment.problem_setup import MIN_SIGMA_PX
@@ -132,7 +132,7 @@ def _tabulate(pairs: TwoViewGeometry, a: int, b: int, grids: Array) -> _Table | 
     if found is None or found.shape != (3, 3):
         return None
     F = np.asarray(found, float)
-    sigma = max(float(np.median(sampson(F, x_a, x_b))) / 0.6745, MIN_SIGMA_PX)
+    sigma = max(float(np.median(sampson(F, x_a, x_b))) / MEDIAN_DEVIATION, MIN_SIGMA_PX)
     f_a, f_b = (f.ravel() for f in np.meshgrid(grids[a] * focal[0], grids[b] * focal[1], indexing="ij"))
     h_a, h_b = (np.column_stack([x, np.ones(len(x))]) for x in (x_a, x_b))
     inverse_a, inverse_b = (

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import span_dimension
-from calib.rig.estimation import MARGIN
+from calib.rig.estimation import MARGIN, MEDIAN_DEVIATION
 from calib.wand.detections import WandDetections, ranges
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.foundation.columns import Columns
@@ -63,7 +63,7 @@ def explain_spacing(wand: Body, detections: WandDetections, lenses: Sequence[Len
     if len(share) < MIN_FRAMES:
         return ""
     found = float(np.median(share))
-    sigma = float(np.median(np.abs(share - found))) / 0.6745 / np.sqrt(len(share))
+    sigma = float(np.median(np.abs(share - found))) / MEDIAN_DEVIATION / np.sqrt(len(share))
     # Sizes may err by `SIGMA_LOG_RANGE` in all frames; the derivative of a share s by log zC is s (1 - s).
     if abs(found - given) < found * (1 - found) * SIGMA_LOG_RANGE + MAX_SIGMAS * sigma:
         return ""

@@ -46,7 +46,6 @@ class RobotShapes:
     def __init__(self, markers: MarkerTable) -> None:
         self._markers, self._declared = markers, markers.position.copy()
         self._known: dict[int, Shape] = {}
-        self._placed: set[int] = set()  # robots whose markers are not used where they are declared
 
     @property
     def displaced_m(self) -> dict[int, float]:
@@ -57,7 +56,6 @@ class RobotShapes:
     def inherit(self, old: "RobotShapes", same: Mapping[int, int]) -> None:
         """Continue with the robots of another one, whose rows `same` has by row."""
         self._known = {row: old._known[k] for row, k in same.items() if k in old._known}
-        self._placed = {row for row, k in same.items() if k in old._placed}
 
     def forget(self) -> None:
         """Forget the windows: they were judged by other cameras. The places in use stay."""
@@ -77,18 +75,22 @@ class RobotShapes:
         """
         before = self._markers.position.copy()
         for robot, shape in shapes.items():
-            if robot in self._placed or np.linalg.norm(shape.off, axis=1).max() > PLACE_M:
-                self._placed.add(robot)
-                self._markers.place(robot, self._places(robot) + shape.off, shape.frame)
+            places = self._places(robot)
+            is_elsewhere = (self._used(robot) != places).any()
+            if is_elsewhere or np.linalg.norm(shape.off, axis=1).max() > PLACE_M:
+                self._markers.place(robot, places + shape.off, shape.frame)
         self._known |= shapes
         return bool(np.linalg.norm(self._markers.position - before, axis=0).max(initial=0.0) > PLACE_M)
 
     def _places(self, robot: int) -> Array:
         return self._declared[:, self._markers.robot == robot].T
 
+    def _used(self, robot: int) -> Array:
+        return self._markers.position[:, self._markers.robot == robot].T
+
     def _learned(self, robot: int, H: Array, y: Array) -> Shape:
-        places, used = self._places(robot), self._markers.position[:, self._markers.robot == robot].T
-        H, y = _of_any_size(places, H, y + H @ (used - places).ravel())
+        places = self._places(robot)
+        H, y = _of_any_size(places, H, y + H @ (self._used(robot) - places).ravel())
         known = self._known.get(robot)
         if known is not None and _agree(known.equations, (H, y)):
             H, y = known.equations[0] + H, known.equations[1] + y

@@ -46,11 +46,9 @@ from camera_node.foundation.arrays import Array, Index
 [potrf], [trsm] = get_lapack_funcs(["potrf"]), get_blas_funcs(["trsm"])
 INTERRUPTED = 4.0  # sigmas, over all coordinates: something hit the wand, or frames are missing
 MAX_ITERATIONS, MAX_ROUNDS = 60, 5
-MAX_PROFILED = (
-    20  # Gauss-Newton steps; up to 13 where cameras agree, any number where they contradict each other
-)
-# Of the variance of n parameters: steps that end without convergence, but as short as that, are right.
-MAX_ADDED = 0.1
+# Gauss-Newton steps: recordings of tests/calib need 13 at most, any number where cameras contradict each other.
+# Steps that end as short as a tenth of the variance of all parameters are right without convergence.
+MAX_PROFILED, MAX_ADDED = 20, 0.1
 START_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-5, 1e-9, 1e6  # the first step is damped by a tenth of the start
 # The last step decreases the cost by less than this share, and this absolute amount.
 ROBUST_TOLERANCE, TOLERANCE, ABSOLUTE_TOLERANCE = 5e-3, 1e-4, 1e-4

@@ -304,7 +304,7 @@ class Adjusted:
     information: Array
     scores: Array
     background_used: Mask
-    converged: bool = True
+    converged: bool
     inflation: float = 1.0
 
 

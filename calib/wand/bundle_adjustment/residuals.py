@@ -458,11 +458,8 @@ def _linearize_images(problem: Problem, state: State) -> tuple[Array, Array, Arr
     n, points = len(background.uv), state.points[background.point]
     error, J_point, J_camera = np.empty((n, 2)), np.empty((n, 2, 3)), np.zeros((n, 2, PER_CAMERA))
     for c in np.unique(background.camera).tolist():
-        rows, T, lens = (
-            np.flatnonzero(background.camera == c),
-            state.cameras[c],
-            state.lens(c, problem.lenses[c]),
-        )
+        rows, T = np.flatnonzero(background.camera == c), state.cameras[c]
+        lens = state.lens(c, problem.lenses[c])
         uv, J, J_pose, J_lens = pixel_jacobians(lens, (points[rows] - T[:3, 3]) @ T[:3, :3])
         error[rows], J_point[rows] = background.uv[rows] - uv, J @ T[:3, :3].T
         J_camera[rows, :, :6], J_camera[rows, :, LENS[0] :] = J_pose, J_lens

@@ -19,11 +19,11 @@ from itertools import combinations
 import msgspec
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.special import stdtrit
+from scipy.special import chdtrc, stdtrit
 
 from calib.errors import CalibrationError, CameraFault
-from calib.rig.camera import LENS, lens_parameters
-from calib.rig.estimation import CHANCE, CLEAR, GROSS, coordinate_sigma
+from calib.rig.camera import LENS, lens_parameters, span_dimension
+from calib.rig.estimation import CHANCE, CLEAR, GROSS, MEDIAN_DEVIATION, coordinate_sigma
 from calib.rig.triangulation import intersect_images
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations
@@ -39,9 +39,8 @@ MAX_SIZE_ERROR = 0.04
 # Of the wand's length: an error of a distance between its markers that displaces cameras beyond what is claimed, and
 # one from which it is not known which distance is right.
 MIN_SPACING_ERROR, MAX_SPACING_ERROR = 0.002, 0.03
-EXACT_M = 1e-6  # the least standard deviation of a distance
-FLAT = 1e-6  # of a wand's longest axis: it has no extent along this one
-MEDIAN_DEVIATION, MEDIAN_EFFICIENCY = 0.6745, 0.37  # in standard deviations, and against theirs
+EXACT_M = 1e-6  # the least standard deviation of a distance: recordings without noise have none
+MEDIAN_EFFICIENCY = 0.37  # of a median deviation, against a standard deviation (Rousseeuw and Croux 1993)
 MIN_MEASURED = 8  # frame sets at which a distance is measured
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
@@ -78,8 +77,6 @@ def _lens_distance(found: Lens, given: Lens, cov: Array) -> float:
 
 def _probability(distance: float) -> float:
     """Probability of a distance of two lenses in sigmas, root mean square, or of a larger one."""
-    from scipy.special import chdtrc
-
     return float(chdtrc(len(LENS), len(LENS) * distance**2))
 
 
@@ -137,7 +134,7 @@ class Spacing:
     @property
     def is_explained(self) -> bool:
         """Whether noise explains the differences: Student's test, with as many degrees of freedom as a median deviation
-        of `count` has by its efficiency (Rousseeuw and Croux 1993)."""
+        of `count` has by its efficiency."""
         limit = -stdtrit(MEDIAN_EFFICIENCY * (self.count - 1), CHANCE / (2 * len(self.count)))
         return bool((np.abs(self.found - self.given) < limit * self.sigma).all())
 
@@ -145,8 +142,7 @@ class Spacing:
         """The wand with its markers at these distances, as near to their places in the file as these allow; markers in
         a line or in a plane stay there, as the cameras may not show more."""
         (first, second), count = self.pairs.T, len(wand.markers)
-        _, sizes, axes = np.linalg.svd(wand.points - wand.points.mean(axis=0))
-        axes = axes[: np.count_nonzero(sizes > FLAT * sizes[0])]
+        axes = np.linalg.svd(wand.points - wand.points.mean(axis=0))[2][: span_dimension(wand.points)]
 
         def residuals(off: Array) -> Array:
             points = wand.points + off.reshape(count, -1) @ axes

@@ -246,9 +246,10 @@ def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQua
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
     expected = _predict(result, positions, covariance, height_m) if result.report.metric else None
     open_lenses = find_open_lenses(find_lens_changes(result.names, result.adjusted))
-    differs = f"{result.report.wand}; this was used: measure both again, and correct the wand file"
-    described = differs if result.report.wand else ""
-    return RigQuality(cameras, unplaced, error, expected, result.report.held_out, open_lenses, described)
+    differs = result.report.wand and (
+        f"{result.report.wand}; this was used: measure both again, and correct the wand file"
+    )
+    return RigQuality(cameras, unplaced, error, expected, result.report.held_out, open_lenses, differs)
 
 
 def wand_positions(result: WandCalibration) -> Array:

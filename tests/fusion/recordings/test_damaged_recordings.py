@@ -132,7 +132,7 @@ def test_a_damaged_recording_of_an_arena_is_used_and_described(tmp_path: Path):
         ["fusion", "plot", path, "--out", tmp_path / "part.png"],
         ["fusion", "repair", path, "--out", tmp_path / "repaired.mcap"],
         ["fusion", "repair", tmp_path / "repaired.mcap"],
-        ["fusion", "trim", tmp_path / "repaired.mcap", tmp_path / "again.mcap"],
+        ["fusion", "replay", tmp_path / "repaired.mcap", "--out", tmp_path / "again.mcap"],
     ]
     for words in commands:
         done = run_program(*words)

@@ -116,8 +116,8 @@ def test_a_robot_of_another_size_stays_as_it_is():
     assert not shapes.displaced_m
 
 
-def test_windows_add_and_one_that_contradicts_them_starts_anew():
-    """A marker that is displaced meanwhile is used where it is now."""
+def test_windows_add_and_one_that_contradicts_them_replaces_them():
+    """Of a marker that is displaced between two windows, the place in the second one is used."""
     rng = np.random.default_rng(0)
     off = one_off(FIVE, 0.01, rng)
     markers = table(FIVE)
