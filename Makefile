@@ -6,7 +6,7 @@ NATIVE := $(shell find camera_node/native fusion/native -name '*.[ch]pp')
 CORES := $(shell find camera_node/native fusion/native -name '*.cpp' ! -name 'bind*')
 
 PIP = $(1)/bin/python -m pip install --quiet --disable-pip-version-check
-TEST = OPENBLAS_NUM_THREADS=1 $(1)/bin/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder --second-run $(ARGS)
+TEST = OPENBLAS_NUM_THREADS=1 $(1)/bin/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder --second-run $(2) $(ARGS)
 # What builds the native modules, and what `pip install` would otherwise fetch for it.
 BUILD_REQUIRES := $(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], "cmake", "ninja", sep="\n")'
 
@@ -16,7 +16,7 @@ demo: .venv/ready
 	@$(BIN)/python -m web --demo $(ARGS)
 
 test: .venv/ready
-	$(call TEST,.venv)
+	$(call TEST,.venv,--durations 5)
 
 check: lint types
 
@@ -79,7 +79,7 @@ newest:
 	@PATH="$(CURDIR)/build/newest/bin:$$PATH" $(call PIP,build/newest) --upgrade --no-build-isolation \
 	  --config-settings build-dir=build/newest/native -e '.[server,dev]'
 	@build/newest/bin/python -m pip freeze --exclude-editable > build/newest/versions.txt
-	$(call TEST,build/newest)
+	$(call TEST,build/newest,-m 'not slow')
 
 clean:
 	rm -rf .venv build

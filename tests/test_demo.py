@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import psutil
+import pytest
 
 from tests.waiting import DEADLINE_S, wait_for
 from web.demo.arena_demo import Demo, conclude
@@ -51,6 +52,7 @@ def test_a_taken_endpoint_is_one_line(scene: Path):
     assert endpoint in result.stderr
 
 
+@pytest.mark.ci
 def test_a_second_demo_finds_another_port(scene: Path, tmp_path: Path):
     """Whether or not a program of this machine has the usual port, now or while the first starts, they differ."""
     folders = [tmp_path / name for name in ("first", "second")]

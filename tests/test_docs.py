@@ -141,6 +141,7 @@ def test_a_lab(zones: tuple[Path, str]):
             assert bridge.stop() == 0
 
 
+@pytest.mark.ci
 def test_the_site_builds_in_strict_mode(tmp_path: Path):
     """Every link and anchor between pages exists, and every page is in the navigation."""
     build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]

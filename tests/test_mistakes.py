@@ -316,6 +316,7 @@ def corrected(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("of_wand", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_remedies_work(of_wand: bool, corrected: Path, monkeypatch: pytest.MonkeyPatch):
     """Each command to which the answers lead ends without an error, in the order of the table."""
@@ -333,6 +334,7 @@ def test_the_remedies_work(of_wand: bool, corrected: Path, monkeypatch: pytest.M
     assert not failed
 
 
+@pytest.mark.ci
 def test_the_remedies_work_in_a_running_arena(corrected: Path, monkeypatch: pytest.MonkeyPatch):
     """The server tracks robot a, and its cameras see another one. A check of its health finds the camera that sends
     nothing."""
@@ -346,6 +348,7 @@ def test_the_remedies_work_in_a_running_arena(corrected: Path, monkeypatch: pyte
     assert execute("recordings", "list", "recorded") == 0
 
 
+@pytest.mark.ci
 def test_the_remedies_that_start_an_arena_work(tmp_path: Path):
     """A number, a name, a port, and no file of robots."""
     port = free_port()

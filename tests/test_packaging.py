@@ -37,6 +37,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(folder.glob("roundel-*.whl"))
 
 
+@pytest.mark.ci
 def test_a_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path):
     """The native modules and the demo's configs come from the wheel, not from the checkout.
 

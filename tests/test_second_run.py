@@ -54,6 +54,7 @@ def closing_line(done: subprocess.CompletedProcess[str]) -> str:
     return done.stdout.strip().splitlines()[-1].strip("=").rsplit(" in ", 1)[0].strip()
 
 
+@pytest.mark.ci
 def test_a_live_test_that_passes_at_its_second_run_is_unstable_and_the_run_is_green(tmp_path: Path):
     """Whether it failed, its fixture did, or its process died."""
     files = {

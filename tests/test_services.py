@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ import pytest
 from camera_node.foundation.errors import TEMPORARY_FAILURE, USER_ERROR
 from tests.conftest import ROOT, free_port
 from tests.fusion.serving import config, serving
+from tests.processes import run_here
 from tests.seccomp import HEADER
 from tests.waiting import DEADLINE_S, Inbox
 
@@ -129,16 +131,8 @@ def test_a_server_that_is_stuck_reports_no_progress(tmp_path: Path, monkeypatch:
 def test_exit_codes_distinguish_mistakes_from_what_may_pass(words: list[str], code: int, tmp_path: Path):
     """The service files restart after all exit codes but 2."""
     (tmp_path / "robots.yaml").write_text((ROOT / "configs" / "robots.yaml").read_text())
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, "-m", *words],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    program, *arguments = words
+    done = run_here(lambda: import_module(f"{program}.__main__").execute(arguments), tmp_path)
     assert done.returncode == code, done.stderr
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1

@@ -39,6 +39,7 @@ def seen(*poses: np.ndarray, probability: float = 1.0, other_turn: float = 0.0) 
     )
 
 
+@pytest.mark.ci
 def test_three_robots_hold_their_distances_under_changing_light():
     """Rendered pictures, the detector, messages and control: no collision, and within 2 cm after 5 s."""
     *_, (_, score) = run_lockstep(SETTLED_S + 2.5, seed=4)

@@ -67,6 +67,7 @@ def test_the_rendered_wand(tmp_path: Path):
     assert Rig.load(tmp_path / "rig.yaml").cameras == result.rig.cameras
 
 
+@pytest.mark.ci
 def test_lenses_that_were_never_calibrated(tmp_path: Path):
     """Without a rig, each lens is found from a nominal one, as its image size is in the messages."""
     recording = save(tmp_path / "wave.mcap", record(ring(3), 8.0))
@@ -80,6 +81,7 @@ def test_a_wand_that_fits_nothing(tmp_path: Path):
         calibrate_wand(ring(3).intrinsics, WAND, recording)
 
 
+@pytest.mark.ci
 def test_a_lens_from_images_and_from_files(tmp_path: Path):
     """Both ways give the same lens, near the one of the renderer; a camera without a board is named."""
     images = [render(*pose) for pose in board_poses(0.6)]
@@ -144,6 +146,7 @@ def test_rendered_images_become_poses(tmp_path: Path):
         assert np.sqrt((error**2).sum(axis=1).mean()) < 1e-3
 
 
+@pytest.mark.ci
 def test_the_poses_of_a_recorded_server_are_repeated(tmp_path: Path):
     """As `roundel replay` repeats them, byte for byte. Half a millimetre from what the server published: the sample's
     server was an earlier version."""

@@ -87,6 +87,7 @@ def test_a_recording_without_poses(tmp_path: Path):
     assert (recording.rig, recording.robots, recording.limits) == (None, None, None)
 
 
+@pytest.mark.ci
 def test_memory_stays_below_the_size_of_the_file(tmp_path: Path):
     """Iterating holds one chunk of the file, 1 MB before compression at most, and the messages decoded from it."""
     path, entries = tmp_path / "long.mcap", list(read_messages(SAMPLE))

@@ -128,6 +128,7 @@ def require_rights(*sessions: zenoh.Session) -> None:
         wait_for(lambda: has_rights(session))  # noqa: B023
 
 
+@pytest.mark.ci
 def test_renewal_replaces_certificates_while_old_ones_are_valid(tmp_path: Path):
     """The server runs with its old certificate and rules, then with the new ones."""
     names = ("camera.north", "viewer")

@@ -48,6 +48,7 @@ def running(keys: Path) -> Iterator[tuple[Program, Program, str]]:
         up.stop()
 
 
+@pytest.mark.ci
 def test_all_programs_work_with_their_certificates(running: tuple[Program, Program, str], keys: Path):
     """An operator changes the settings of both cameras, a viewer none; without a certificate no program connects."""
     up, camera, endpoint = running

@@ -47,6 +47,13 @@ if sys.platform == "linux":
     prctl(24, 23, 0, 0, 0)
 os.execv(sys.argv[1], sys.argv[1:])
 """
+# Without a graphics card the processor draws the scene, as often as it can: a core while the page shows an arena. Five
+# small pictures a second are enough for a test.
+DRAW_SELDOM = """
+const draw = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = callback => window.setTimeout(() => draw(callback), 200);
+window.cancelAnimationFrame = window.clearTimeout.bind(window);
+"""
 _until_the_end = ExitStack()
 
 
@@ -121,8 +128,9 @@ def browsing(view: View, url: str = "") -> Iterator[Page]:
             errors.append(message.text)
 
     with _start_chromium(CHROMIUM)() as browser:
-        page = browser.new_page(viewport={"width": 1000, "height": 700})
+        page = browser.new_page(viewport={"width": 1000, "height": 700}, device_scale_factor=0.25)
         page.set_default_timeout(1e3 * DEADLINE_S)
+        page.add_init_script(DRAW_SELDOM)
         page.on("console", record)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(url or view.access.address)

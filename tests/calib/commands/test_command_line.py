@@ -110,6 +110,7 @@ def test_an_error_is_one_line_and_nothing_is_overwritten(
     assert (tmp_path / "rig.yaml").read_text() == "precious"
 
 
+@pytest.mark.ci
 def test_a_full_disk_changes_no_file(tmp_path: Path, arena: Arena):
     """A limit of 1000 bytes per file acts like a full disk."""
     (tmp_path / "rig.yaml").write_text("precious")
@@ -272,6 +273,7 @@ def test_intrinsics_refuse_invalid_boards_and_images(tmp_path: Path):
     assert not (tmp_path / "rig.yaml").exists()
 
 
+@pytest.mark.ci
 def test_one_bad_camera_does_not_discard_the_other_lenses(tmp_path: Path):
     """Exit code 2 with the reason for the bad one; the lens of the good one is written."""
     for k, pose in enumerate(board_poses(0.6)):

@@ -40,6 +40,7 @@ def test_the_shipped_plan_as_text_and_as_a_page(tmp_path: Path):
     assert "north" in html
 
 
+@pytest.mark.ci
 def test_the_result_of_a_rig_as_json_and_pdf(tmp_path: Path):
     """A calibrated rig needs no plan: the floor under its cameras is evaluated."""
     cameras = {name: camera.camera() for name, camera in load_yaml(SHIPPED, Plan).cameras.items()}

@@ -263,7 +263,7 @@ def printed_command(capsys: pytest.CaptureFixture[str], data: ImportData) -> lis
     return shlex.split(lines.split("next: ")[1])[3:]
 
 
-@pytest.mark.parametrize("name", ["multicamselfcal", "caliscope"])
+@pytest.mark.parametrize("name", ["multicamselfcal", pytest.param("caliscope", marks=pytest.mark.ci)])
 def test_the_printed_command_calibrates(tmp_path: Path, capsys, name: FormatName):
     """A result of MultiCamSelfCal, scaled by the distance of its cameras, and a board of Caliscope."""
     truth = write_selfcal_result(tmp_path) if name == "multicamselfcal" else write_caliscope_session(tmp_path)

@@ -139,7 +139,7 @@ def test_exact_without_noise(model: Model):
     assert np.linalg.norm(off - off.mean(axis=0), axis=1).max() < 0.1
 
 
-@pytest.mark.parametrize("model", COEFFICIENTS)
+@pytest.mark.parametrize("model", ["pinhole", pytest.param("fisheye", marks=pytest.mark.ci)])
 def test_the_covariance_of_the_lens_is_honest(model: Model):
     """Squared Mahalanobis errors of the parameters follow chi-square with 4 + D degrees each; the prior reduces them
     by next to nothing with 24 views."""
@@ -238,6 +238,7 @@ def test_residuals_are_drawn():
     assert (picture[34:] != picture[-1, -1]).any(axis=2).mean() > 0.01
 
 
+@pytest.mark.ci
 def test_lenses_of_webcams(shared_data: Callable[[str], Path]):
     """Real views of a distant board: the projection uncertainty covers the difference from another session's lens.
     Three sigmas of both; those of the other session are unknown and taken as equal: 3 sqrt(2) of ours, in the middle
@@ -259,6 +260,7 @@ def test_merging_keeps_other_cameras():
     assert list(merge_lenses(Rig(cameras={"cam9": other}), {}, {}).cameras) == ["cam9"]
 
 
+@pytest.mark.ci
 def test_a_chessboard_under_uneven_light_is_found_as_precisely():
     """Twelve poses, in light that is too bright on one side of the image and dark on the other: the finder by sectors
     misses some, the fallback finds all of these, with corners as precise as its own on the others."""
@@ -311,7 +313,7 @@ def test_pixels_that_are_not_square_are_found_where_the_views_show_it(ratio: flo
     assert any("not square" in warning for warning in lens.warnings()) == (ratio != 1.0)
 
 
-@pytest.mark.parametrize("model", COEFFICIENTS)
+@pytest.mark.parametrize("model", [pytest.param("pinhole", marks=pytest.mark.ci), "fisheye"])
 def test_the_better_lens_model_is_suggested(model: Model):
     """Views through a very wide fisheye lens suggest it, and never the other."""
     lens = Lens(

@@ -220,6 +220,7 @@ def test_a_recording_is_saved_and_can_be_calibrated_again_by_the_printed_command
     assert_near(load_rig(out), arena.truth, 2e-4, 2e-4)  # no noise
 
 
+@pytest.mark.ci
 def test_a_trial_whose_process_ends_is_reported_and_the_next_one_succeeds():
     """Also if the process ends while it waits for the next trial."""
     arena, now_s = ring(3), count(10.0, 10.0)

@@ -135,7 +135,9 @@ os._exit(0)
 """
 
 
-@pytest.mark.parametrize("step", ["save", "undo", "redo"])
+@pytest.mark.parametrize(
+    "step", ["save", *(pytest.param(step, marks=pytest.mark.ci) for step in ("undo", "redo"))]
+)
 def test_a_process_that_is_killed_at_any_step_leaves_a_readable_rig_and_all_versions(
     tmp_path: Path, step: str
 ):

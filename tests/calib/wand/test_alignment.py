@@ -105,6 +105,7 @@ def test_a_shift_of_seconds_is_named_as_such():
         calibrate(recorded.intrinsics, LIGHT, stamped, synchronous=True)
 
 
+@pytest.mark.ci
 def test_drifts_are_stored_and_hold_at_both_ends_of_a_recording(tmp_path: Path):
     """Clocks of 3000 ppm: after half of twelve seconds they are 9 ms apart, and the rig has the rest to 0.3 ms."""
     drifting = {"offset_ms": 150, "drift_ppm": 3000, "sigma_px": 0.1, "outliers": 0.0}

@@ -83,6 +83,7 @@ def solved(with_background: bool, seed: int) -> tuple[Rig, WandCalibration]:
     return arena.truth, calibrate(rig, STICK, wand, None, True, beside if with_background else ())
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seeds", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_errors_far_from_the_wand_are_halved_and_claimed(seeds: int):
     """Poses have the errors that their covariance claims: within the 99.9 % range of chi-square."""

@@ -5,6 +5,7 @@ import math
 
 import msgspec
 import numpy as np
+import pytest
 
 from calib.wand.calibrate import calibrate
 from calib.wand.detections import MAX_CLOCK_ERROR_S, stamp_sigmas
@@ -31,6 +32,7 @@ def delay(messages: list[Detections], seconds: int, bound_ms: float, seed: int) 
     return changed
 
 
+@pytest.mark.ci
 def test_frames_with_uncertain_timestamps_do_not_disturb_the_rig():
     """A quarter of the timestamps is wrong by up to 15 ms, and the cameras stay within four reported standard
     deviations. Without the weights, 15 ms at 1 m/s are errors of up to 15 mm."""

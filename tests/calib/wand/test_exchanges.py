@@ -58,15 +58,16 @@ CASES = {
     "free-running, swapped": (4, STICK, True, False),
     "free-running, rotated": (4, STICK, True, True),
 }
-EVERYDAY = (
-    "synchronous, rotated",
-    "free-running, swapped",
-)  # both wands, both kinds of clocks and of exchanges
+MARKS = {
+    "synchronous, swapped": [pytest.mark.slow],
+    "synchronous, rotated": [
+        pytest.mark.ci
+    ],  # with the other one: both wands, both kinds of clocks and of exchanges
+    "free-running, rotated": [pytest.mark.slow],
+}
 
 
-@pytest.mark.parametrize(
-    "case", [*EVERYDAY, *(pytest.param(c, marks=pytest.mark.slow) for c in CASES if c not in EVERYDAY)]
-)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=MARKS.get(case, [])) for case in CASES])
 def test_exchanged_points_are_named_and_left_out(case: str):
     """Shares are those of a binomial distribution, and of the free-running cameras' points at least half is found: the
     rest is so near to where the own camera sees the marker that it cannot be attributed. Clocks are right to 4.5
@@ -90,6 +91,7 @@ def test_exchanged_points_are_named_and_left_out(case: str):
         assert camera_errors(result.rig, recorded.truth)[0].max() < 0.005
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("free_running", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_other_outliers_are_no_exchanged_points(free_running: bool):
     """A tenth of the points is anywhere in the image: by chance, none of the pairs reaches 2 %."""

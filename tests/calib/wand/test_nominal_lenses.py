@@ -49,6 +49,7 @@ def with_field_of_view(arena: Arena, degrees: float) -> Arena:
     return Arena(Rig(cameras=cameras))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "degrees", [*(pytest.param(degrees, marks=pytest.mark.slow) for degrees in (50.0, 60.0)), 70.0]
 )

@@ -66,6 +66,7 @@ def test_one_frame_of_one_side_leaves_a_camera_out_where_it_allows_two_poses():
     assert "allow two poses" in result.report.unplaced["cam2"]
 
 
+@pytest.mark.ci
 def test_free_running_cameras_are_joined_by_the_body_too():
     arena = ring(4, wand=CUBE)
     messages = wave(arena, 1, 80, 0, period_ns=50_000_000, phase=0.24)
@@ -84,6 +85,7 @@ def test_cameras_that_never_saw_the_wand_together_are_named_with_what_would_conn
         assert "any side of the wand" in reason
 
 
+@pytest.mark.ci
 def test_cameras_that_see_the_wand_one_after_the_other_get_an_initial_pose():
     arena, messages = one_after_the_other((2, 2), 200)
     recording = label_recording(arena.intrinsics, CUBE, messages)
@@ -150,6 +152,7 @@ def test_one_view_of_a_plane_leaves_two_poses_and_a_second_camera_decides():
     assert transform(found, square) == pytest.approx(transform(T_cam_wand, square), abs=0.02)
 
 
+@pytest.mark.ci
 def test_ten_frames_of_many_numbered_points_place_the_cameras():
     """A board of 240 points: the sample of detections for two views holds six frames of them, of which eight are
     needed."""
@@ -175,6 +178,7 @@ def test_ten_frames_of_many_numbered_points_place_the_cameras():
 DATA = Path(os.environ.get("ROUNDEL_SHARED_DATA", "/work/shared/data")) / "tag_wand"
 
 
+@pytest.mark.ci
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"{DATA} is absent")
 def test_the_tag_wand_of_tagslam_places_all_eight_cameras(tmp_path: Path):
     """One camera sees a single tag in a single frame, another shares no tag with any. A plain bundle adjustment of all

@@ -60,6 +60,7 @@ def test_a_distance_gives_a_light_its_scale():
     assert_near(by_tape.rig, arena.truth, 5e-3, 2e-3)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("off", "seeds"),
     [(OLD, (21,)), *(pytest.param(off, (20, 21, 23), marks=pytest.mark.slow) for off in (EXACT, OLD))],
@@ -97,6 +98,7 @@ def halves(seed: int, off: tuple[float, float, float]) -> list[CameraPoses]:
     ]
 
 
+@pytest.mark.ci
 def test_a_distance_is_compared_with_the_wand():
     """The true distance agrees within three standard deviations; one that is 2 % off causes a warning with its size."""
     arena = ring()
@@ -144,6 +146,7 @@ def test_faults_are_named(tmp_path: Path):
     assert np.linalg.norm(places[0] - places[1]) == pytest.approx(2, abs=1e-6)
 
 
+@pytest.mark.ci
 def test_check_and_the_trials_of_a_session_use_the_distance(tmp_path: Path):
     """Both predict errors in millimetres for a light with a distance, and none without."""
     arena = ring(3, wand=LIGHT)

@@ -43,6 +43,7 @@ def trace(result: WandCalibration) -> float:
     return float(np.trace(result.covariance))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seeds", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_covariance_is_that_with_numbers(seeds: int):
     """Clock offsets of 150 ms and 50 ppm, 5 % of gross errors, 10 % missing markers. Frames with a missing or wrong
@@ -96,6 +97,7 @@ def test_ends_are_distinguished(scenario: WandScenario):
     assert (right == usual).mean() > 0.995
 
 
+@pytest.mark.ci
 def test_cameras_with_faults_are_named():
     """One has a clock error of three seconds and is placed, one shares too few frame sets."""
     recorded = record(replace(LIGHTS, cameras=4, seconds=8.0))

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command line: a mistake of the user is reported as one line with exit code 2."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.processes import run_program
+
 pytestmark = pytest.mark.computed
-
-
-def run(*arguments: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "camera_node", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
 @pytest.mark.parametrize(
@@ -34,7 +29,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess:
 def test_mistakes_are_one_line(tmp_path: Path, arguments: list[str], says: str):
     (tmp_path / "0.png").write_bytes(b"no image")
     arguments = [str(tmp_path) if argument == "FRAMES" else argument for argument in arguments]
-    done = run(*arguments, *([] if "--name" in arguments else ["--name", "cam0"]))
+    done = run_program("camera_node", *arguments, *([] if "--name" in arguments else ["--name", "cam0"]))
     assert done.returncode == (75 if "99" in arguments else 2)  # a device may be plugged in later
     assert says in done.stderr
     assert done.stderr.startswith("error: ")
@@ -42,7 +37,7 @@ def test_mistakes_are_one_line(tmp_path: Path, arguments: list[str], says: str):
 
 
 def test_help_and_wrong_options():
-    assert "--source" in run("--help").stdout
-    wrong = run("--colour", "red")
+    assert "--source" in run_program("camera_node", "--help").stdout
+    wrong = run_program("camera_node", "--colour", "red")
     assert wrong.returncode == 2
     assert "Traceback" not in wrong.stderr

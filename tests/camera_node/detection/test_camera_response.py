@@ -76,6 +76,7 @@ def test_one_picture_shows_what_its_camera_does_to_covered_roundels(sensor: Sens
     assert share_found(Detector(), sensor, partial(covered, 0.2, False), 2) > share
 
 
+@pytest.mark.ci
 def test_one_picture_shows_a_filmic_curve_and_light_that_falls_off():
     """46 % were found: an exponent at its limit counted as exact, covered roundels did not teach the light, and the
     curve hid where cards end."""
@@ -173,7 +174,9 @@ def test_a_camera_that_denoises_and_sharpens_is_learned():
     assert share > goal - 4 * np.sqrt(goal * (1 - goal) / CARDS)
 
 
-@pytest.mark.parametrize("level", [2.0, 5.0, 15.0])
+@pytest.mark.parametrize(
+    "level", [2.0, *(pytest.param(level, marks=pytest.mark.ci) for level in (5.0, 15.0))]
+)
 @pytest.mark.parametrize("camera", DARK.values(), ids=DARK.keys())
 def test_noise_of_dark_places_makes_no_roundels(camera: Camera, level: float):
     """A tone curve amplifies it, a mosaic and denoising correlate it: up to three in a frame were found, because

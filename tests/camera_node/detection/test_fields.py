@@ -51,7 +51,7 @@ def test_a_bend_that_small_roundels_do_not_show_is_claimed(bend):
     assert 1 - 3 * 0.22 < measured.centre < CLAIM  # of bent paper 64 without the claim
 
 
-@pytest.mark.parametrize("what", ["soft shadow", "gloss"])
+@pytest.mark.parametrize("what", [pytest.param("soft shadow", marks=pytest.mark.ci), "gloss"])
 def test_uneven_light_is_within_the_claims(what):
     sensor, disturb, _ = KINDS[what]
     measured = errors(acquainted(RUN, sensor), sensor, BAND, 3, disturb)
@@ -85,7 +85,7 @@ def test_a_shading_that_contradicts_its_prior_is_claimed_before_the_camera_is_kn
 
 @pytest.mark.parametrize(
     ("camera", "disturb", "due"),
-    [(NOISE, gloss, CLAIM), (Video("libx264", 2_000_000), even, 1.6)],
+    [(NOISE, gloss, CLAIM), pytest.param(Video("libx264", 2_000_000), even, 1.6, marks=pytest.mark.ci)],
     ids=["gloss", "H.264"],
 )
 def test_one_picture_claims_residuals_that_are_correlated_along_the_edges(camera, disturb, due):
@@ -95,7 +95,7 @@ def test_one_picture_claims_residuals_that_are_correlated_along_the_edges(camera
     assert 0.5 < measured.centre < due
 
 
-@pytest.mark.parametrize("name", ["clean", "mild"])
+@pytest.mark.parametrize("name", [pytest.param("clean", marks=pytest.mark.ci), "mild"])
 def test_cluttered_ground_is_within_the_claims(name):
     """Mean squared errors of 160 coordinates have a standard deviation of 0.11; with equal weights 6, and without the
     fall-off of the mild camera's light 2.8."""

@@ -44,7 +44,13 @@ def test_the_bound_of_a_frontal_disc_is_that_of_its_edges(diameter: float, blur:
     assert 0.98 < limit.distance_variance(3) * size < 1.25
 
 
-@pytest.fixture(scope="module", params=[(16, 30, 3.0, 0.7), (30, 45, 3.0, 1.0), (40, 15, 1.0, 0.5)])
+@pytest.fixture(
+    scope="module",
+    params=[
+        (16, 30, 3.0, 0.7),
+        *(pytest.param(cell, marks=pytest.mark.ci) for cell in ((30, 45, 3.0, 1.0), (40, 15, 1.0, 0.5))),
+    ],
+)
 def errors(request: pytest.FixtureRequest) -> Errors:
     return measure_cell(RUN, Cell(*request.param), VIEWS, DRAWS)
 

@@ -99,6 +99,7 @@ def test_an_occluded_roundel_is_found_on_the_first_frame(share: float, from_rim:
     assert recall(Run("chords", Detector, False), 3, occluded(share, from_rim)) > least - chance
 
 
+@pytest.mark.ci
 def test_the_position_of_a_new_occluded_roundel_is_consistent():
     """With bars over 30 % of the diameter, at most one in fifty errors of disc centres exceeds nine sigmas.
 

@@ -174,7 +174,7 @@ def test_a_kind_that_was_quiet_for_long_is_written_at_once_again():
     assert [at_s for at_s, _, _ in log.lines[before:]] == [3000.0]
 
 
-@pytest.mark.parametrize("kinds", [1, 5, 15, 60])
+@pytest.mark.parametrize("kinds", [1, 5, 15, pytest.param(60, marks=pytest.mark.ci)])
 def test_lines_under_attack_are_bounded_and_none_is_uncounted(kinds: int):
     """However many kinds: the first line of each, and digests as often as the logarithm of the duration."""
     log, limits = flooded(kinds, 30.0, FUZZED_S), LogLimits()

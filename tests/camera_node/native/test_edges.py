@@ -5,6 +5,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.conftest import ROOT
 from tests.native import build
@@ -13,6 +14,7 @@ NATIVE = ROOT / "camera_node" / "native"
 SOURCES = "edge_pixels", "normal_equations"
 
 
+@pytest.mark.ci
 def test_separate_edges_and_the_whole_give_the_same_normal_equations(tmp_path: Path):
     """All 13 x 13 products, by the Jacobians of three ellipses and by the columns of the whole.
 

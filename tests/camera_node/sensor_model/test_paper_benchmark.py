@@ -89,6 +89,7 @@ def test_v_max_of_the_model_is_within_a_pixel_of_the_measured_range():
     assert measured == pytest.approx(predicted, abs=1.0)
 
 
+@pytest.mark.ci
 def test_detection_ends_where_the_threshold_says():
     found = threshold.share_found(threshold.Condition(), 13.0)
     assert found >= threshold.RECALL

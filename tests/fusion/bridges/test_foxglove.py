@@ -41,6 +41,7 @@ def nanoseconds(stamp: Any) -> int:
     return stamp.seconds * 10**9 + stamp.nanos
 
 
+@pytest.mark.ci
 def test_foxglove_shows_the_arena_and_continues_after_a_restart(tmp_path: Path):
     with (
         ServerProcess(saving(tmp_path)) as server,

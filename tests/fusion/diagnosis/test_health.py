@@ -171,6 +171,7 @@ def server_with_a_robot_elsewhere(folder: Path) -> Iterator[tuple[str, Callable[
         )
 
 
+@pytest.mark.ci
 def test_what_is_missing_or_refused_is_no_health(tmp_path: Path):
     """A robot that was never found, a camera whose images have another size, and one whose stamps jump by a second
     while it is started again."""

@@ -110,7 +110,7 @@ def scaled(cameras: dict[str, Camera], scale: float) -> dict[str, Camera]:
     return {name: msgspec.structs.replace(c, T_world_cam=place(c)) for name, c in cameras.items()}
 
 
-@pytest.mark.parametrize("percent", [0, 1, 2])
+@pytest.mark.parametrize("percent", [*(pytest.param(percent, marks=pytest.mark.ci) for percent in (0, 1)), 2])
 def test_the_scale_of_a_recording(
     percent: int, recorded: list[Detections], folder: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -161,6 +161,7 @@ def test_the_scale_does_not_become_certain_by_waiting():
     assert abs(many.scale - 1) < 3 * many.scale_sigma
 
 
+@pytest.mark.ci
 def test_the_covariance_of_the_rig_explains_the_scale():
     """Rigs that are drawn from their covariance have scales as uncertain as stated: chi-square over six of them."""
     rng, sigma = np.random.default_rng(3), np.array([5e-4] * 3 + [2e-3] * 3)

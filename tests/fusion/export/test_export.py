@@ -168,6 +168,7 @@ def test_rerun_reads_its_recording(recording: Path, tmp_path: Path):
         np.testing.assert_allclose([rows[t] for t in expected], list(expected.values()), rtol=1e-6)
 
 
+@pytest.mark.ci
 def test_c3d_is_read_by_two_libraries(recording: Path, tmp_path: Path):
     out = tmp_path / "out.c3d"
     assert export(recording, out) == 0

@@ -109,6 +109,7 @@ def test_two_recordings_are_compared_where_both_have_the_robot(
     assert not (tmp_path / "none.png").exists()
 
 
+@pytest.mark.ci
 def test_the_command_writes_a_picture_and_replaces_none(tmp_path: Path):
     recording = write_recording(tmp_path / "a.mcap", {"rover": 1})
     assert plot(recording) == 0

@@ -26,7 +26,9 @@ def require_harmless(outcome: Outcome, faulty: dict) -> None:
     assert named == set(faulty)
 
 
-@pytest.mark.parametrize("step_ms", [10, -25, 500, -1000])
+@pytest.mark.parametrize(
+    "step_ms", [-25, *(pytest.param(step_ms, marks=pytest.mark.ci) for step_ms in (10, 500, -1000))]
+)
 def test_a_clock_that_jumps_is_reported_and_corrected(step_ms: float):
     """The first frame shows the jump and its size."""
     faulty = {"cam1": step(FAULT_S, step_ms * 1e-3)}
@@ -39,6 +41,7 @@ def test_a_clock_that_jumps_is_reported_and_corrected(step_ms: float):
     assert corrected_ms == pytest.approx(-step_ms, abs=1.0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("lasts_s", [1.0, 0.3])
 def test_a_jump_that_ends_is_corrected_once_more(lasts_s: float):
     """By 15 intervals, like 15 missing frames: only the correction shows that they would arrive before they were sent.
@@ -50,7 +53,7 @@ def test_a_jump_that_ends_is_corrected_once_more(lasts_s: float):
     assert len([t_s for t_s in outcome.used["cam1"] if back_s + 1.0 < t_s]) > 20
 
 
-@pytest.mark.parametrize("step_ms", [25, -25])
+@pytest.mark.parametrize("step_ms", [25, pytest.param(-25, marks=pytest.mark.ci)])
 def test_a_recording_without_arrival_times_shows_the_same(step_ms: float):
     """As `fusion run` reads from CSV and frames: each frame arrives at its own stamp. A step back is certain, one ahead
     may be a pause: the robots decide."""
@@ -61,7 +64,9 @@ def test_a_recording_without_arrival_times_shows_the_same(step_ms: float):
     assert outcome.in_use_since_s("cam1") < FAULT_S + RECOVERED_S
 
 
-@pytest.mark.parametrize(("first_ms", "second_ms", "cameras"), [(25, -50, 4), (25, 25, 5)])
+@pytest.mark.parametrize(
+    ("first_ms", "second_ms", "cameras"), [(25, -50, 4), pytest.param(25, 25, 5, marks=pytest.mark.ci)]
+)
 def test_two_clocks_that_jump_at_once_are_both_corrected(first_ms: float, second_ms: float, cameras: int):
     faulty = {"cam1": step(FAULT_S, first_ms * 1e-3), "cam2": step(FAULT_S, second_ms * 1e-3)}
     outcome = fuse(replace(LOAD, cameras=cameras), DURATION_S, faulty)
@@ -71,6 +76,7 @@ def test_two_clocks_that_jump_at_once_are_both_corrected(first_ms: float, second
         assert outcome.in_use_since_s(name) < FAULT_S + RECOVERED_S
 
 
+@pytest.mark.ci
 def test_a_jump_while_robots_stand_still_is_corrected_by_the_arrival():
     faulty = {"cam1": step(FAULT_S, 0.025)}
     outcome = fuse(replace(LOAD, speed_m_s=0.0), DURATION_S, faulty)
@@ -78,6 +84,7 @@ def test_a_jump_while_robots_stand_still_is_corrected_by_the_arrival():
     assert outcome.reported_s("cam1") < FAULT_S + REPORTED_S
 
 
+@pytest.mark.ci
 def test_a_clock_that_drifts_is_reported_before_it_harms():
     """2000 ppm are the offset of 200 ppm after ten times as long."""
     faulty = {"cam1": drift(FAULT_S, 2000.0)}
@@ -85,6 +92,7 @@ def test_a_clock_that_drifts_is_reported_before_it_harms():
     require_harmless(outcome, faulty)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("ppm", "reported_s", "duration_s"),
     [
@@ -105,6 +113,7 @@ def test_a_slow_drift_is_reported_and_followed(ppm: float, reported_s: float, du
     assert outcome.worst_m(FAULT_S) < 0.007  # 4.6 mm without a drift
 
 
+@pytest.mark.ci
 def test_a_drift_that_ends_is_not_corrected_any_more():
     """The clock is set, so its rate may have ended: poses were wrong for 15 s after that."""
     load, set_s = replace(LOAD, robots=6, speed_m_s=0.5), FAULT_S + 3.0
@@ -168,6 +177,7 @@ def test_a_drift_that_is_not_measured_any_more_becomes_uncertain():
     assert uncertain(replace(frame_set, frames=(admitted, others[0])), 1.0) == set()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("speed_m_s", "duration_s"),
     [
@@ -182,6 +192,7 @@ def test_an_inaccurate_calibration_is_no_drift(speed_m_s: float, duration_s: flo
     assert fuse(load, duration_s, {}, rig=inaccurate(load.rig, 0.2)).log == []
 
 
+@pytest.mark.ci
 def test_an_inaccurate_calibration_loses_no_robot():
     """0.3 px in two rotations, and twice that at the edge by the third and the focal length, are 0.95 px: 5.6 mm at
     5 m. Once, a pose was 2 to 3 m off."""
@@ -191,7 +202,7 @@ def test_an_inaccurate_calibration_loses_no_robot():
     assert outcome.worst_m(1.0) < 3 * 0.0056
 
 
-@pytest.mark.parametrize("speed_m_s", [0.0, 2.0])
+@pytest.mark.parametrize("speed_m_s", [pytest.param(0.0, marks=pytest.mark.ci), 2.0])
 def test_correct_clocks_are_not_reported(speed_m_s: float):
     outcome = fuse(replace(LOAD, speed_m_s=speed_m_s), 6.0, {})
     assert outcome.log == []
@@ -205,7 +216,7 @@ def test_the_bound_of_a_clock_error_is_bounded():
         assert clock_sigma_s(absurd) == pytest.approx(MAX_CLOCK_ERROR_S / np.sqrt(3))
 
 
-@pytest.mark.parametrize("step_s", [0.5, -0.1])
+@pytest.mark.parametrize("step_s", [pytest.param(0.5, marks=pytest.mark.ci), -0.1])
 def test_a_jump_that_all_cameras_share_harms_no_pose(step_s: float):
     """Before: all were excluded, and without a frame set no search brought them back. A robot that stands is where it
     was at any time."""
@@ -217,6 +228,7 @@ def test_a_jump_that_all_cameras_share_harms_no_pose(step_s: float):
     assert all(max(times) > 2.9 for times in outcome.used.values())
 
 
+@pytest.mark.ci
 def test_two_cameras_that_jump_differently_come_back():
     """No frame set remains that could judge them: their stamps and arrivals do."""
     load = Load(robots=1, cameras=2, hz=30.0, speed_m_s=0.0)
@@ -227,6 +239,7 @@ def test_two_cameras_that_jump_differently_come_back():
         assert max(outcome.used[name]) > 4.8
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("step_ms", [25.0, pytest.param(-25.0, marks=pytest.mark.slow)])
 def test_no_pose_is_wrong_after_a_step_that_arrivals_hide(step_ms: float):
     """Before: poses were up to 0.4 m wrong for a second, until motion contradicted the stamps."""

@@ -205,7 +205,7 @@ def test_inverses_are_inverse_matrices():
         _core.inverses(information)
 
 
-@pytest.mark.parametrize("spread", [1.0, 2.0])
+@pytest.mark.parametrize("spread", [pytest.param(1.0, marks=pytest.mark.ci), 2.0])
 def test_candidates_are_the_pairs_within_the_gates(spread):
     """Discs a few pixels from detections: some pairs are too far apart, and some sizes do not fit.
 

@@ -61,6 +61,7 @@ def damaged_sample(folder: Path, at: int = 6) -> Path:
     return path
 
 
+@pytest.mark.ci
 def test_a_wrong_byte_anywhere_costs_one_chunk_and_is_reported(tmp_path: Path):
     """At every byte of the records' headers, and at random elsewhere: a message that is not read is counted, and its
     time is. A repair makes the file readable for other readers, too, and says the same."""
@@ -117,6 +118,7 @@ def test_a_damaged_first_chunk_without_the_index_costs_no_other(tmp_path: Path, 
     assert repair_recording(path).n_messages == len(found)
 
 
+@pytest.mark.ci
 def test_a_damaged_recording_of_an_arena_is_used_and_described(tmp_path: Path):
     """Each command goes on, and says how many messages and seconds are missing."""
     path = damaged_sample(tmp_path)

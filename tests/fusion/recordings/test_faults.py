@@ -128,7 +128,7 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
     assert indexed(tmp_path / "a.mcap") == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.ci), signal.SIGINT])
 def test_a_signal_closes_the_recording(tmp_path, number):
     path = tmp_path / "live.mcap"
     with recorder(tmp_path, "record", str(path)) as (process, publish):
@@ -140,6 +140,7 @@ def test_a_signal_closes_the_recording(tmp_path, number):
     assert KEYS.rig in {key for key, _, _ in indexed(path)}
 
 
+@pytest.mark.ci
 def test_a_full_disk_ends_the_recording_in_one_line(tmp_path):
     """The file is closed within the space that it has, and every message of its index is readable."""
     path = tmp_path / "live.mcap"
@@ -240,6 +241,7 @@ def test_repair_can_leave_the_original(tmp_path, capsys):
     assert "is complete" in capsys.readouterr().out
 
 
+@pytest.mark.ci
 def test_a_recording_rotates(tmp_path):
     """Each file is readable by itself, with rig and robots; together they hold every message once."""
     path = tmp_path / "live.mcap"

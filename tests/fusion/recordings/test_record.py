@@ -229,6 +229,7 @@ def smoothed(arena: Arena, smooth: bool, n: int = 18) -> list[TrackingResult]:
     return list(fuse_recording(arrivals, OfflineArena(precise(arena.cameras), arena.robots, smooth=smooth)))
 
 
+@pytest.mark.ci
 @pytest.mark.computed
 def test_smoothing_is_more_accurate_and_its_covariance_is_consistent():
     """Velocities improve most if the cameras are synchronous, because the filter then has them from the past only. The

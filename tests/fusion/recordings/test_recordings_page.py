@@ -57,6 +57,7 @@ def test_the_sample_is_shown(tmp_path: Path):
         assert view.stop() == 0
 
 
+@pytest.mark.ci
 def test_the_commands_that_the_sample_suggests_run(tmp_path: Path):
     said = roundel("sample", "small arena", folder=tmp_path)
     commands = [line.strip() for line in said.splitlines() if line.startswith("  roundel ")]
@@ -68,6 +69,7 @@ def test_the_commands_that_the_sample_suggests_run(tmp_path: Path):
     assert files >= {"new.yaml", "poses.csv", "recording.png"}
 
 
+@pytest.mark.ci
 def test_the_notebook_runs(tmp_path: Path):
     """Its cells, one after the other, as Jupyter runs them."""
     sample(tmp_path / "sample")

@@ -2,6 +2,7 @@
 """Rigs whose errors are larger than they state, or that state none: claims grow to what the robots show."""
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from fusion.rig_graph.hypotheses import Verdict
@@ -20,6 +21,7 @@ def squared(outcome: Outcome) -> np.ndarray:
     return np.array([s**2 for p, s in rows if seconds(p.t_ns) > BEGUN_S and p.state == "tracked"])
 
 
+@pytest.mark.ci
 def test_a_rig_that_states_no_errors_is_learnt():
     """Errors of one rig are the same in all poses: half of these lie within what nine of ten rigs do not exceed."""
     outcome = fuse(LOAD, 3.5, {}, rig=inaccurate(LOAD.rig, 1.5))

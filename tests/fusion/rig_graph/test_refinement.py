@@ -108,6 +108,7 @@ def test_a_lens_that_changes_is_corrected(percent: float):
     assert all("camera cam2 by" in str(found) for found in refined)
 
 
+@pytest.mark.ci
 def test_poses_that_drift_are_followed():
     """All cameras turn by half a degree in an hour. Each correction states what is left, and the next go on from it."""
     cameras, rng = ring(4), np.random.default_rng(3)

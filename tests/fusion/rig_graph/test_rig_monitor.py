@@ -29,7 +29,12 @@ FRAMES = 170  # of each camera: 20 frame sets that are compared
 
 
 @pytest.mark.parametrize(
-    ("turn_deg", "shift_m"), [(2.0, 0.0), pytest.param(0.0, 0.02, marks=pytest.mark.slow), (-2.0, 0.02)]
+    ("turn_deg", "shift_m"),
+    [
+        (2.0, 0.0),
+        pytest.param(0.0, 0.02, marks=pytest.mark.slow),
+        pytest.param(-2.0, 0.02, marks=pytest.mark.ci),
+    ],
 )
 def test_a_moved_camera_is_excluded_within_a_second_and_recalibrated(turn_deg, shift_m):
     """Poses stay within 2 mm. About 300 roundels within 1 m determine the position of a camera 4 m away to 6 mm;
@@ -73,7 +78,9 @@ def around(t: float) -> tuple[np.ndarray, np.ndarray]:
     return rotation_from_vector([0, 0, t]), np.array([0.7 * np.sin(0.7 * t), 0.6 * np.cos(0.5 * t), 0.2])
 
 
-@pytest.mark.parametrize(("off_m", "reported"), [(0.02, True), (0.005, True), (0.0, False)])
+@pytest.mark.parametrize(
+    ("off_m", "reported"), [pytest.param(0.02, True, marks=pytest.mark.ci), (0.005, True), (0.0, False)]
+)
 def test_a_misplaced_marker_is_found_and_no_camera_is_blamed(off_m, reported, caplog):
     """The only robot in view of four cameras: 5 mm are 0.8 px, of which a fit of three markers leaves half. Its markers
     are used where they are, but for less than is corrected, also after another robot was declared."""
@@ -119,7 +126,8 @@ def test_of_four_cameras_one_of_which_is_silent_the_moved_one_is_found():
 
 
 @pytest.mark.parametrize(
-    ("turn_deg", "axis", "excluded"), [(1.0, (0.36, 0.92, -0.16), False), (3.0, (-0.88, -0.43, 0.2), True)]
+    ("turn_deg", "axis", "excluded"),
+    [pytest.param(1.0, (0.36, 0.92, -0.16), False, marks=pytest.mark.ci), (3.0, (-0.88, -0.43, 0.2), True)],
 )
 def test_of_two_cameras_one_of_which_turns_no_pose_is_wrong(turn_deg, axis, excluded):
     """By one degree robots appear 60 mm away, with the same residuals in all windows: undecided, and some are too
@@ -198,6 +206,7 @@ def test_two_of_three_cameras_that_are_moved_one_after_the_other_stay_excluded()
     assert not any(c.has_returned for c in corrections)
 
 
+@pytest.mark.ci
 def test_of_many_cameras_of_which_three_see_robots_none_is_blamed(caplog):
     """Nothing is remembered that would show which of them moved: the judgement ended in an exception."""
     cameras = ring(5)
@@ -213,6 +222,7 @@ def test_of_many_cameras_of_which_three_see_robots_none_is_blamed(caplog):
     assert "can't be judged" not in caplog.text
 
 
+@pytest.mark.ci
 def test_robots_are_found_while_claims_count_large_errors_and_these_end():
     """Cameras that contradicted each other agree again: claims stayed as large, and let no robot be found that would
     have shown that."""

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from camera_node.protocol.session import LEASE_MS, open_client
@@ -56,6 +57,7 @@ def longest_silence_s(endpoint: str) -> float:
     return longest_s
 
 
+@pytest.mark.ci
 def test_frozen_listeners_do_not_stop_the_server(tmp_path: Path):
     """Zenoh closes their connections in threads that serve all, and would wait 10 s for their last bytes."""
     assert WATCHED_S > 3e-3 * LEASE_MS

@@ -109,6 +109,7 @@ def test_false_roundels_do_not_delay_poses(tmp_path: Path, n: int):
             assert_undisturbed(observer, before)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("key", "payload"),
     [

@@ -49,6 +49,7 @@ def is_calibrated(arena: VirtualArena, camera: str) -> bool:
     return arena.server.pipeline.cameras[camera].T_world_cam == arena.load.rig[camera].T_world_cam
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("times", [2, pytest.param(len(TURNS), marks=pytest.mark.slow)])
 def test_a_camera_that_returns_has_its_calibrated_pose_however_often_it_was_moved(
     arena: VirtualArena, times: int
@@ -64,6 +65,7 @@ def test_a_camera_that_returns_has_its_calibrated_pose_however_often_it_was_move
         assert is_calibrated(arena, "cam1")
 
 
+@pytest.mark.ci
 def test_recalibrations_do_not_add_up(arena: VirtualArena):
     """While one camera is at a pose that is known to a millimetre, another one returns to that of its calibration."""
     turn(arena, "cam0", TURNS[0])

@@ -46,6 +46,7 @@ def test_a_slow_link_builds_no_backlog(apart: tuple[LiveArena, Namespaces]):
     assert max(ages, default=MAX_AGE_S) < MAX_AGE_S
 
 
+@pytest.mark.ci
 def test_poses_return_within_a_second_of_a_restart(tmp_path: Path):
     """After an absence that is longer than the first intervals of reconnection."""
     with LiveArena(tmp_path, LOAD) as arena:

@@ -93,7 +93,10 @@ def require_in_force(endpoint: str, file: Path, done: subprocess.CompletedProces
     assert f"in force on the server at {endpoint}, arena 'test'" in done.stdout
 
 
-@pytest.mark.parametrize("command", ["undo", "redo", "world", "apply"])
+@pytest.mark.parametrize(
+    "command",
+    [*(pytest.param(command, marks=pytest.mark.ci) for command in ("undo", "redo", "world")), "apply"],
+)
 def test_a_command_in_a_fresh_process_changes_the_rig_of_the_server(tmp_path: Path, command: str):
     settings, file = saving(tmp_path), tmp_path / "mine.yaml"
     first, second = (
@@ -113,6 +116,7 @@ def test_a_command_in_a_fresh_process_changes_the_rig_of_the_server(tmp_path: Pa
         require_in_force(endpoint, file, run_program("calib", *words, *server))
 
 
+@pytest.mark.ci
 def test_a_wand_calibration_in_a_fresh_process_is_in_force_on_the_server(tmp_path: Path):
     arena, file = ring(3), tmp_path / "new.yaml"
     save_rig(arena.intrinsics, tmp_path / "lenses.yaml")

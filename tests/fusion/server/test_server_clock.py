@@ -13,6 +13,7 @@ from tests.benchmarks.faults.judge import MAX_ERROR_M
 from tests.benchmarks.faults.live_clocks import drift_live, set_system_clock
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("ahead_s", [(0.5, -3600.0), pytest.param((-0.5, 3600.0), marks=pytest.mark.slow)])
 def test_no_pose_changes_when_the_system_clock_is_set(tmp_path: Path, ahead_s: tuple[float, ...]):
     """Server and cameras are programs whose system clock is set twice while a robot drives at 0.94 m/s."""

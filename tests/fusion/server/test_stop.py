@@ -23,7 +23,7 @@ runpy.run_module("fusion", run_name="__main__", alter_sys=True)
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.ci)])
 def test_a_signal_during_garbage_collection_ends_the_server(tmp_path: Path, number: signal.Signals):
     """Before: the interrupt was ignored, and the server served for ever."""
     settings = config(tmp_path)

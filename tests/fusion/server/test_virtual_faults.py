@@ -13,6 +13,7 @@ from tests.benchmarks.faults.world import CameraFault
 pytestmark = pytest.mark.computed
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("seconds", "kinds", "seed"),
     [
@@ -32,6 +33,7 @@ def test_a_faulty_camera_makes_no_pose_wrong(
     assert result.rms_m < 0.002
 
 
+@pytest.mark.ci
 def test_false_roundels_of_one_camera_blame_no_marker(tmp_path: Path):
     """Before, four of ten robots had "loose" markers after two seconds."""
     with VirtualArena(tmp_path, small_load()) as arena:

@@ -60,7 +60,11 @@ def squared_error(load: Load, cameras: dict[str, Camera], rng: np.random.Generat
 
 @pytest.mark.parametrize(
     ("markers", "sigma_px", "states_errors"),
-    [(1, 0.1, True), (4, 0.1, False), (4, 0.01, True)],
+    [
+        pytest.param(1, 0.1, True, marks=pytest.mark.ci),
+        pytest.param(4, 0.1, False, marks=pytest.mark.ci),
+        (4, 0.01, True),
+    ],
     ids=["one marker", "four markers, of a rig that states nothing", "a precise detector"],
 )
 def test_the_errors_of_the_rig_are_claimed(markers: int, sigma_px: float, states_errors: bool):

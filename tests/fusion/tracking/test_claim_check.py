@@ -81,6 +81,7 @@ def test_of_four_cameras_the_turned_one_is_among_those_that_contradict_each_othe
     assert {"cam0", "cam2"}.isdisjoint(found.names)
 
 
+@pytest.mark.ci
 def test_of_three_cameras_none_is_named():
     """Two that turned together would look like the third."""
     (found,) = contradictions(frames(3), with_turned(ring(3), "cam1", 3 * DEGREES))

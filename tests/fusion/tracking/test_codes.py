@@ -40,6 +40,7 @@ def errors(arena: Arena, pose: RobotPose) -> tuple[float, float]:
     return float(np.linalg.norm(np.array(pose.position) - p)), float(turned[2])
 
 
+@pytest.mark.ci
 def test_identical_robots_of_one_coded_roundel_are_tracked_with_their_headings():
     """From rendered pictures, by detectors and messages, to poses: three robots without a start, of which one turns.
 

@@ -94,6 +94,7 @@ def test_moving_constellations_that_differ_by_a_centimetre_are_distinguished():
     assert got.tracked > 0.95
 
 
+@pytest.mark.ci
 def test_a_crossing_crowd_is_not_swapped():
     """Ten robots with three identical roundels cross each other; every fourth detection is missing."""
     got = identity(Load(10, 3, 6, 30.0, crossing=True, missing=0.25, false=2.0), 4.0)
@@ -132,6 +133,7 @@ def test_no_detection_is_in_two_markers():
         assert len(np.unique(marker.cameras)) == len(marker.cameras) >= 2
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("robots", [80, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_crowd_is_acquired_at_once(robots: int):
     """800 markers of 200 robots, of which a camera sees more than 600. Half of the robots must be tracked from the
@@ -151,6 +153,7 @@ def test_a_crowd_is_acquired_at_once(robots: int):
     assert tracked[-1] == robots
 
 
+@pytest.mark.ci
 def test_cold_starts_with_missing_frames_acquire_no_wrong_robot():
     """Ten robots before four cameras, a third of whose frames are missing. Markers of different robots, seen by two
     cameras, have the distances of a robot in one of a hundred of these acquisitions. Most robots are acquired at once:
@@ -249,7 +252,9 @@ def test_one_camera_tracks_a_constellation_but_not_a_single_marker(robot):
     assert tracked.all() if robot == "a" else not tracked[-20:].any()
 
 
-@pytest.mark.parametrize("speed_m_s", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize(
+    "speed_m_s", [*(pytest.param(speed, marks=pytest.mark.ci) for speed in (0.0, 1.0)), 2.0]
+)
 def test_accuracy_and_covariance_at_speed(speed_m_s):
     """Free-running cameras, a tenth of the detections missing. Four robots in 70 frame sets with correlated errors give
     about 100 independent samples: the mean squared error is 1 +- 4 sqrt(2 / 6 / 100). The tracker is as accurate as a

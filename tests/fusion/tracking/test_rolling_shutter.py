@@ -45,6 +45,7 @@ def position_error(readout_s: float, uses_rows: bool = True) -> float:
     return 1e3 * float(np.sqrt(np.mean(squared)))
 
 
+@pytest.mark.ci
 def test_errors_are_those_of_a_global_shutter():
     """Within 1.3 times; without the row times, markers are off by up to half of 30 ms at 2 m/s."""
     exact = position_error(0.0)

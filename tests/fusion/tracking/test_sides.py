@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from msgspec import convert
 
 from calib.rig.camera import Camera
@@ -97,6 +98,7 @@ def test_a_tumbling_cube_is_tracked_within_the_bound():
     assert np.sqrt(mine.mean() / np.mean(best[SETTLED:])) < 1.15
 
 
+@pytest.mark.ci
 def test_a_cube_is_acquired_at_once_and_never_at_a_wrong_pose():
     """At 15 poses, with three false detections in each frame. In the median the first complete frame set is enough; the
     tracked share of 99 % allows for ten frame sets in 1000."""
@@ -170,6 +172,7 @@ def test_published_markers_have_the_normals_of_their_sides():
     assert along.min() > np.cos(np.radians(1))
 
 
+@pytest.mark.ci
 def test_a_rendered_cube_is_tracked():
     """The demo's cube for one second: rendered, detected, tracked with the true rig, in the first frame set. A wrong
     marker would make errors of centimetres."""

@@ -21,6 +21,7 @@ def markers_of(arena: Arena, n: int, cameras: str, later: str = "", seconds: flo
     return [tracker.track(frame_set).markers for frame_set in synchronizer.finish()]
 
 
+@pytest.mark.ci
 def test_position_errors_match_their_covariance_and_one_candidate_is_the_normal():
     """Squared Mahalanobis errors follow chi-square with 3 degrees of freedom: the mean of 40 runs is below
     3 + 4 sqrt(6 / 40). The noise floor exceeds the noise of the centres, so the lower bound is that of the range alone,

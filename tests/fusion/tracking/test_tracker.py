@@ -105,6 +105,7 @@ def test_a_hidden_robot_coasts_is_lost_and_is_acquired_again(run_arena):
     assert np.abs(errors(arena, poses("a")[-5:])[:, 3:]).max() < 3e-3
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("cameras", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_covariance_matches_the_errors_from_the_first_pose_on(cameras):
     """The velocity of a robot that was just acquired is unknown, so free-running cameras determine its position to
@@ -170,6 +171,7 @@ def test_a_single_marker_has_a_position_and_a_normal_and_a_large_variance_of_its
         assert pose.covariance_matrix[2, 2] > 9
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("speed", [pytest.param(0.0, marks=pytest.mark.slow), 0.8])
 def test_an_unlabeled_marker_has_position_velocity_and_normal(speed: float):
     """Squared Mahalanobis errors of position and velocity in the last of ten frame sets follow chi-square with 3

@@ -66,6 +66,7 @@ def test_from_unknown_cameras_to_poses_with_two_commands(start, scene: Path, tmp
     assert not psutil.wait_procs(children, timeout=DEADLINE_S)[1]
 
 
+@pytest.mark.ci
 def test_a_camera_keeps_its_name_and_its_settings(start, tmp_path: Path):
     """Renamed and changed while it runs, it has both after a restart of all programs; so has an edited file."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"

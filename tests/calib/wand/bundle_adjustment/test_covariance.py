@@ -41,6 +41,7 @@ def halves(arena: Arena, messages: list[Detections]) -> tuple[list[WandCalibrati
     return found, compare_calibrations(*map(CameraPoses.of_calibration, found))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("correlated", "expected", "seeds"),
     [

@@ -45,6 +45,7 @@ def placed(seed: int, off: tuple[float, float, float], with_sigma: bool) -> Wand
     return result
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("off", "with_sigma", "seeds"),
     [
@@ -66,6 +67,7 @@ def test_covariances_of_rigs_from_inaccurate_lenses_are_right(
     assert chi2.ppf(0.001, degrees) < squared < chi2.ppf(0.999, degrees)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "seed", [SEEDS[0], *(pytest.param(seed, marks=pytest.mark.slow) for seed in SEEDS[1:])]
 )
@@ -184,6 +186,7 @@ def test_a_lens_is_declared_exact_but_own_calibrations_state_at_least_its_stabil
     assert stated == pytest.approx((5e-4 * camera.fx, 2.0, 0.3, 1.0, 5e-4, 2e-4, 2e-5, 2e-5, 2e-4))
 
 
+@pytest.mark.ci
 def test_widened_priors_make_the_covariance_of_changed_lenses_right():
     """Lenses 2.5 times as far off as their files say, which the recording does not show: covariances are too small
     until the priors are 2.5 times as wide. Over 50 recordings and lenses the squared error is 3.3 and 0.8 of its

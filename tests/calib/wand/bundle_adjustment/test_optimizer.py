@@ -146,6 +146,7 @@ def test_missing_time_in_all_cameras_rejects_no_observation():
     assert not result.drift_sigma_ppm.any()
 
 
+@pytest.mark.ci
 def test_clocks_and_lenses_are_adjusted_where_the_data_need_it(recorded: SimulatedRecording):
     """Offsets are right within four standard deviations and 0.3 ms; true lenses stay within four of theirs."""
     result = calibrate(recorded.intrinsics, WandScenario().wand, recorded.messages)
@@ -162,6 +163,7 @@ def scale_focal(recorded: SimulatedRecording, name: str, factor: float) -> Rig:
     return Rig(cameras={**recorded.intrinsics.cameras, name: wrong})
 
 
+@pytest.mark.ci
 def test_a_camera_that_the_recording_contradicts_is_named_and_left_out(recorded: SimulatedRecording):
     """The other cameras are within four reported standard deviations."""
     messages = [mirror(m) if m.camera == "cam01" else m for m in recorded.messages]
@@ -172,6 +174,7 @@ def test_a_camera_that_the_recording_contradicts_is_named_and_left_out(recorded:
     assert (off_mm < 4 * np.array([camera.sigma_mm for camera in result.report.cameras])).all()
 
 
+@pytest.mark.ci
 def test_half_of_the_lenses_may_be_wrong(recorded: SimulatedRecording):
     """Three of six focal lengths are 15 % to 20 % off: all cameras are placed, within the reported covariance."""
     wrong = dict(recorded.intrinsics.cameras)
@@ -200,6 +203,7 @@ def test_drift_is_estimated():
     assert (np.abs(result.drift_ppm - truth + truth.mean()) < 4 * result.drift_sigma_ppm).all()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seeds", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_the_covariance_of_time_offsets_that_drifts_extrapolate_is_right(seeds: int):
     """Two of four cameras see the wand in the first quarter only, so their offsets, which hold in the middle, follow by
@@ -222,6 +226,7 @@ def test_the_covariance_of_time_offsets_that_drifts_extrapolate_is_right(seeds: 
     assert chi2.ppf(0.001, degrees) < squared < chi2.ppf(0.999, degrees)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seeds", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_noise_gives_no_clock_parameters(seeds: int):
     """Three synchronized cameras, 15 s of a stick at 10 Hz, 1.5 px of noise, 5 % of gross errors: there are no offsets;

@@ -53,6 +53,7 @@ def test_a_clock_that_jumps_is_named(scenario: WandScenario, camera: str, ms: fl
     assert "its clock jumps by" in jump.sentence()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seed", [6, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 2, 5, 7))])
 def test_the_reason_of_a_camera_that_is_left_out_names_its_clock(seed: int):
     """A jump of 0.1 s half way: half of the camera's observations contradict the others. Another pose explains many of

@@ -80,6 +80,7 @@ def test_lenses_with_their_centre_in_the_middle_do_not_tell_mirrored_images():
     assert len(calibrate(Rig(cameras=middle), STICK, recorded.messages, synchronous=True).names) == 4
 
 
+@pytest.mark.ci
 def test_a_wand_that_is_not_flat_shows_mirrored_images():
     recorded = wave(BODY)
     with pytest.raises(CalibrationError, match=r"markers are mirrored against its file: .* disable the flip"):
@@ -105,6 +106,7 @@ def moved_half_way(arena: Arena, shifts: dict[str, tuple[float, float, float]]) 
     return [m for m in before if m.seq < 80] + [m for m in after if m.seq >= 80]
 
 
+@pytest.mark.ci
 def test_a_camera_that_moves_is_named_with_the_time():
     arena = ring()
     report = calibrate(arena.intrinsics, WAND, moved_half_way(arena, {"cam2": (0.0, 0.3, -0.3)})).report
@@ -115,6 +117,7 @@ def test_a_camera_that_moves_is_named_with_the_time():
     assert float(at[2]) == pytest.approx(0.3 * 2**0.5, rel=0.1)
 
 
+@pytest.mark.ci
 def test_cameras_that_contradict_each_other_are_refused():
     """Two of four move: nothing is written. The first half of the recording is calibrated, as the message says."""
     arena = ring()

@@ -31,7 +31,12 @@ def change_of(name: str, rig: Rig, seed: int) -> LensChange:
 
 
 @pytest.mark.parametrize(
-    ("index", "by", "number", "named"), [(1, 8.0, 4, "fx / fy"), (6, 0.004, 6, "p1"), (7, 0.004, 7, "p2")]
+    ("index", "by", "number", "named"),
+    [
+        pytest.param(1, 8.0, 4, "fx / fy", marks=pytest.mark.ci),
+        pytest.param(6, 0.004, 6, "p1", marks=pytest.mark.ci),
+        (7, 0.004, 7, "p2"),
+    ],
 )
 def test_a_lens_of_another_shape_is_adjusted_and_named(index: int, by: float, number: int, named: str):
     """A ratio of focal lengths 1 % off, or a tilted sensor: it moves pixels in the corner by 4."""
@@ -46,7 +51,9 @@ def test_a_lens_of_another_shape_is_adjusted_and_named(index: int, by: float, nu
     assert f", {named} " in change.sentence()
 
 
-@pytest.mark.parametrize("factor", [0.85, pytest.param(1.1, marks=pytest.mark.slow), 1.2])
+@pytest.mark.parametrize(
+    "factor", [0.85, pytest.param(1.1, marks=pytest.mark.slow), pytest.param(1.2, marks=pytest.mark.ci)]
+)
 def test_a_lens_known_from_a_data_sheet_or_another_camera_is_adjusted(factor: float):
     """Focal lengths of data sheets are 9 % off and more. The camera stays, with its focal length right to 4 sigmas."""
     rig = recorded(1).intrinsics
