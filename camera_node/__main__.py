@@ -10,7 +10,12 @@ from camera_node.foundation.program import run
 
 def main() -> None:
     """The entry point of `roundel-camera`."""
-    run(lambda: run_program(COMMANDS, sys.argv[1:], PUBLISH, "python -m camera_node"))
+    run(lambda: execute(sys.argv[1:]))
+
+
+def execute(arguments: list[str]) -> int | None:
+    """Run a command line."""
+    return run_program(COMMANDS, arguments, PUBLISH, "python -m camera_node")
 
 
 if __name__ == "__main__":

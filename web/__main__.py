@@ -9,7 +9,12 @@ from web.roundel.command import VIEW
 
 def main() -> None:
     """The entry point of `roundel-web`."""
-    run(lambda: VIEW.run(sys.argv[1:], "roundel view"))
+    run(lambda: execute(sys.argv[1:]))
+
+
+def execute(arguments: list[str]) -> int | None:
+    """Run a command line."""
+    return VIEW.run(arguments, "roundel view")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ def test_a_rod_in_a_running_arena(tmp_path: Path):
         cameras = [sys.executable, "-m", "tests.fusion.carried_rod", endpoint]
         with killed_at_end(cameras, cwd=ROOT), Client.connect(endpoint, arena="test") as client:
             wait_for(lambda: len(client.markers(DEADLINE_S).next()))
-            words = ("--object", str(tmp_path / "rod.yaml"), "--live", "--seconds", str(2 * LOOP_S), "--json")
+            words = ("--object", str(tmp_path / "rod.yaml"), "--live", "--seconds", str(LOOP_S), "--json")
             done = run_program("fusion", "verify", *words, "--connect", endpoint, "--arena", "test")
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads(done.stdout)

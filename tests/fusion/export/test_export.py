@@ -335,7 +335,13 @@ def test_a_recording_too_long_for_c3d_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("package", "out"),
-    [("ezc3d", "out.c3d"), ("rosbags", "bag"), ("pyarrow", "out.parquet"), ("rerun", "out.rrd")],
+    [
+        ("ezc3d", "out.c3d"),
+        *(
+            pytest.param(*case, marks=pytest.mark.ci)
+            for case in (("rosbags", "bag"), ("pyarrow", "out.parquet"), ("rerun", "out.rrd"))
+        ),
+    ],
 )
 def test_without_its_library_one_line_says_what_to_install(recording: Path, package: str, out: str):
     advice = advice_without(package, "fusion", "export", str(recording), str(recording.with_name(out)))
