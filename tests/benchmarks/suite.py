@@ -48,7 +48,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     """Hook of the process that reports."""
     if report.when == "teardown":
-        _costs[report.nodeid] += dict(report.user_properties)[PROPERTY]
+        (cost,) = (value for name, value in report.user_properties if name == PROPERTY)
+        _costs[report.nodeid] += float(str(cost))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
