@@ -12,16 +12,16 @@ import shlex
 import subprocess
 import sys
 import time
-from collections import Counter
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-N_COSTLIEST = 20
+N_SHOWN = 40
 PROPERTY = "core-seconds"
 STARTED = pytest.StashKey[float]()
-_costs: Counter[str] = Counter()
+_costs: defaultdict[str, float] = defaultdict(float)
 
 
 def core_seconds() -> float:
@@ -53,13 +53,13 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    folders: Counter[str] = Counter()
+    folders: defaultdict[str, float] = defaultdict(float)
     for name, cost in _costs.items():
         parts = Path(name.partition("::")[0]).parts
         folders["/".join(parts[:3]) if len(parts) > 3 else "/".join(parts[:2])] += cost
-    for title, costs in (("folders", folders.most_common()), ("tests", _costs.most_common(N_COSTLIEST))):
+    for title, costs in (("folders", folders), ("tests", _costs)):
         terminalreporter.section(f"core-seconds of {title}")
-        for name, cost in costs:
+        for name, cost in sorted(costs.items(), key=lambda entry: -entry[1])[:N_SHOWN]:
             terminalreporter.write_line(f"{cost:7.1f}  {name}")
 
 
