@@ -125,6 +125,7 @@ def zones(tmp_path: Path, endpoint: str) -> Iterator[tuple[Path, str]]:
         assert [server.stop() for server in servers] == [0, 0]
 
 
+@pytest.mark.ci
 def test_a_lab(zones: tuple[Path, str]):
     """Health and doctor report that the cameras are missing; the bridge of another machine connects to both routers."""
     folder, endpoint = zones

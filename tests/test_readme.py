@@ -72,17 +72,6 @@ def test_every_command_has_a_test():
     assert [command for command in OWN if not command.startswith(tested)] == []
 
 
-def test_the_program_of_the_readme_reads_the_arena_of_roundel_up(folder: Path):
-    """A copy of it gets poses of a user's own first arena."""
-    (code,) = PYTHON.findall(README)
-    up = Program(
-        words(f"roundel up lab --source --headless --local --listen tcp/127.0.0.1:{free_port()}"), folder
-    )
-    (name,) = re.findall(r"server of arena '(.*)' at", up.until("^server of arena"))
-    assert up.stop(signal.SIGTERM) == 0
-    assert f'arena="{name}"' in code
-
-
 def test_the_readme_is_short():
     """At most 700 words, with one picture, which is in the repository."""
     assert len(README.split()) <= 700
@@ -129,15 +118,17 @@ def test_the_plan(folder: Path):
 
 
 def test_an_arena_of_one_machine(folder: Path):
-    """`roundel up` creates its folder, and serves the page until it is stopped."""
+    """`roundel up` creates its folder, and serves the page until it is stopped. A copy of the README's program reads this
+    arena."""
     port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
-    command = [*words(find("roundel up")), "--port", str(port), "--listen", endpoint]
-    with subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as up:
-        try:
-            wait_for_port(port)
-        finally:
-            up.terminate()
-        assert up.wait(30) == 0
+    up = Program([*words(find("roundel up")), "--port", str(port), "--listen", endpoint], folder)
+    try:
+        (name,) = re.findall(r"server of arena '(.*)' at", up.until("^server of arena"))
+        wait_for_port(port)
+    finally:
+        assert up.stop(signal.SIGTERM) == 0
+    (code,) = PYTHON.findall(README)
+    assert f'arena="{name}"' in code
     assert {"arena.yaml", "wand.yaml", "cameras", "recordings"} <= {
         p.name for p in (folder / "lab").iterdir()
     }

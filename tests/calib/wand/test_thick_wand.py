@@ -18,7 +18,7 @@ def test_a_thick_wand_is_as_exact_as_one_without_thickness():
     contradicts the others, and the reason says what the file may lack. With it, the error of a normal remains: 1 degree
     moves a print by 0.17 mm in one frame set."""
     arena = ring(4, wand=BOARD)
-    messages = record(arena)
+    messages = record(arena, 7.0)
     assert_near(calibrate(arena.intrinsics, BOARD, messages).rig, arena.truth, 3e-4, 2e-4)
     thin = msgspec.structs.replace(BOARD, thickness_m=0.0)
     unplaced = calibrate(arena.intrinsics, thin, messages).report.unplaced

@@ -22,7 +22,7 @@ def test_a_robot_in_a_running_arena_is_defined_and_replaced_on_request_only(tmp_
     """By the command, while the server tracks another one; the output is an entry for robots.yaml. A declared name is
     refused before the measurement, and its declaration stays."""
     with serving_an_unknown_robot(tmp_path) as (endpoint, client):
-        done = run_define(endpoint, "b", "--diameter", "0.12", "--seconds", "4", "--motion", "ground")
+        done = run_define(endpoint, "b", "--diameter", "0.12", "--seconds", "1", "--motion", "ground")
         assert done.returncode == 0, done.stderr
         assert "the server now tracks b, with 3 markers" in done.stdout
         wait_for(lambda: client.robot("b", DEADLINE_S).next().state == "tracked")

@@ -23,6 +23,7 @@ TRACKED = re.compile(r"^(?:rover|drone): tracked (\d+\.\d)%", re.MULTILINE)
 MIN_TRACKED = 98.0  # percent; the page shows what was printed when it was written
 
 
+@pytest.mark.ci
 def test_the_sample_is_processed_cut_and_exported(tmp_path: Path):
     for command in (SAMPLE, *COMMANDS):
         output = roundel(*shlex.split(command)[1:], folder=tmp_path)
