@@ -118,8 +118,7 @@ def test_the_plan(folder: Path):
 
 
 def test_an_arena_of_one_machine(folder: Path):
-    """`roundel up` creates its folder, and serves the page until it is stopped. A copy of the README's program reads this
-    arena."""
+    """`roundel up` creates its folder and serves the page until it is stopped; the README's program names its arena."""
     port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
     up = Program([*words(find("roundel up")), "--port", str(port), "--listen", endpoint], folder)
     try:

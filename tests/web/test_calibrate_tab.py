@@ -33,6 +33,7 @@ from web.view import View
 ARENA = ring(3)
 
 
+@pytest.mark.ci
 def test_the_world_is_measured_shown_and_accepted(
     arena: LiveArena, subscription: Subscription, tmp_path: Path
 ):

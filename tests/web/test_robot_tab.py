@@ -81,6 +81,7 @@ def test_a_robot_is_changed_by_clicks(arena: tuple[Client, View], tmp_path: Path
         wait_for(lambda: client.declared_robots().robots == {})
 
 
+@pytest.mark.ci
 def test_changes_are_undone_where_they_were_made(arena: tuple[Client, View]):
     """The latest first; a robot that another program changed since is left as it is."""
     client, view = arena

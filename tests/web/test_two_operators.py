@@ -44,6 +44,7 @@ def choose(page: Page, label: str, option: str) -> None:
     page.get_by_role("option", name=option, exact=True).click()
 
 
+@pytest.mark.ci
 def test_each_operator_sees_the_other_s_changes_and_keeps_its_own_text(arena: tuple[Client, View]):
     client, view = arena
     with browsing(view) as one:

@@ -109,7 +109,7 @@ def test_contrast_is_judged_before_the_picture_is_made_linear():
     ],
     ids=["gamma", "vignetting", "shading", "denoising", "JPEG", "mild"],
 )
-@pytest.mark.parametrize("band", [(14, 20), (32, 60)])
+@pytest.mark.parametrize("band", [(14, 20), pytest.param((32, 60), marks=pytest.mark.ci)])
 def test_centre_and_size_are_within_their_claims(sensor: Sensor, band):
     """The issue's goal is three times the claimed variance; without the model it was 10 to 30 times."""
     measured: Errors = errors(known(sensor), sensor, band, 2)

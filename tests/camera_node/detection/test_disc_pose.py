@@ -96,7 +96,7 @@ def test_locate_all_agrees_with_locate():
 DEMO = {"fx": 566.4, "fy": 566.1, "distortion": (-0.112, 0.031, 0.0004, -0.0003, 0.0)}  # camera north's
 
 
-@pytest.mark.parametrize("at", [(322.0, 237.0), (80.0, 80.0)])
+@pytest.mark.parametrize("at", [(322.0, 237.0), pytest.param((80.0, 80.0), marks=pytest.mark.ci)])
 @pytest.mark.parametrize("tilt_deg", [20, 50])
 def test_poses_through_the_demos_lens_are_unbiased(at: tuple[float, float], tilt_deg: float):
     """Distance within 0.05 % and the image of the disc's centre within 0.01 px, plus three sigmas of the mean.

@@ -75,7 +75,7 @@ def test_vrpn_clients_get_a_warning(endpoint: str):
     assert body[8:] == b"rover is lost\0"
 
 
-@pytest.mark.parametrize("message", ["odometry", "vision"])
+@pytest.mark.parametrize("message", ["odometry", pytest.param("vision", marks=pytest.mark.ci)])
 def test_an_autopilot_learns_that_the_odometry_has_failed(endpoint: str, message: str):
     with (
         server_process(endpoint) as server,

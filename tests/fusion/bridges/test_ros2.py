@@ -124,8 +124,8 @@ def ros_peer(endpoint: str) -> zenoh.Session:
     return zenoh.open(config)
 
 
-@pytest.mark.parametrize("humble", [False, True])
-@pytest.mark.parametrize("own_router", [False, True])
+@pytest.mark.parametrize("humble", [False, pytest.param(True, marks=pytest.mark.ci)])
+@pytest.mark.parametrize("own_router", [False, pytest.param(True, marks=pytest.mark.ci)])
 def test_a_node_of_rmw_zenoh_receives_the_robots_and_lists_the_topics(humble, own_router):
     options = ["--humble"] * humble
     received, tokens = queue.Queue(), queue.Queue()

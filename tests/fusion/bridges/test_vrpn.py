@@ -39,7 +39,7 @@ def motion_capture(host: str) -> Iterator[Iterator[dict[str, list[float]]]]:
 
 
 @pytest.mark.parametrize(
-    "scheme", ["tcp://", ""]
+    "scheme", ["tcp://", pytest.param("", marks=pytest.mark.ci)]
 )  # the latter asks by UDP for a connection, and reports come by UDP
 def test_vrpns_own_client_reads_the_robots(endpoint: str, scheme: str):
     with (
@@ -60,7 +60,7 @@ def test_vrpns_own_client_reads_the_robots(endpoint: str, scheme: str):
         assert len(np.unique(rows, axis=0)) >= 15  # they move
 
 
-@pytest.mark.parametrize("udp", [False, True])
+@pytest.mark.parametrize("udp", [pytest.param(False, marks=pytest.mark.ci), True])
 def test_every_pose_arrives_once_with_its_time_and_velocity(endpoint: str, udp: bool):
     times: dict[str, list[int]] = {"rover": [], "drone": []}
     with PoseServer(endpoint) as server, serving(endpoint) as port, VrpnReader(port, udp) as reader:

@@ -202,6 +202,7 @@ def test_an_inaccurate_calibration_loses_no_robot():
     assert outcome.worst_m(1.0) < 3 * 0.0056
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("speed_m_s", [pytest.param(0.0, marks=pytest.mark.ci), 2.0])
 def test_correct_clocks_are_not_reported(speed_m_s: float):
     outcome = fuse(replace(LOAD, speed_m_s=speed_m_s), 6.0, {})

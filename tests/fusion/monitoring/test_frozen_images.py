@@ -50,7 +50,7 @@ def run(arena: Arena, frames: list[CalibratedFrame]):
     return poses, refused
 
 
-@pytest.mark.parametrize("sigma_px", [0.1, 0.0])
+@pytest.mark.parametrize("sigma_px", [0.1, pytest.param(0.0, marks=pytest.mark.ci)])
 def test_a_frozen_image_is_excluded_while_it_lasts(sigma_px, caplog):
     """Robots move by 1.5 px in 0.05 s; until then the old image is right to as much. 1.5 px are 9 mm."""
     arena = Arena(ROBOTS, MOVING, sigma_px=sigma_px)

@@ -18,7 +18,9 @@ def raise_error(*_: object) -> None:
     raise ValueError("a bug that some input shows")
 
 
-@pytest.mark.parametrize("stage", ["a task", "tracking", "association", "the status"])
+@pytest.mark.parametrize(
+    "stage", ["a task", "tracking", "association", pytest.param("the status", marks=pytest.mark.ci)]
+)
 def test_the_server_continues_after_any_exception(tmp_path: Path, caplog, stage: str):
     """Before: the server's loop ended with the first exception that was not of NumPy or GTSAM."""
     with serving(config(tmp_path)) as (server, client):

@@ -52,7 +52,12 @@ def test_a_lens_of_another_shape_is_adjusted_and_named(index: int, by: float, nu
 
 
 @pytest.mark.parametrize(
-    "factor", [0.85, pytest.param(1.1, marks=pytest.mark.slow), pytest.param(1.2, marks=pytest.mark.ci)]
+    "factor",
+    [
+        pytest.param(0.85, marks=pytest.mark.ci),
+        pytest.param(1.1, marks=pytest.mark.slow),
+        pytest.param(1.2, marks=pytest.mark.ci),
+    ],
 )
 def test_a_lens_known_from_a_data_sheet_or_another_camera_is_adjusted(factor: float):
     """Focal lengths of data sheets are 9 % off and more. The camera stays, with its focal length right to 4 sigmas."""
