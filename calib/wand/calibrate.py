@@ -50,14 +50,11 @@ from calib.wand.initial_rig import (
 )
 from calib.wand.labels import explain_codes, explain_wand, label_recording
 from calib.wand.quality.checks import (
-    MAX_SPACING_ERROR,
-    MIN_SPACING_ERROR,
     check_lenses,
     check_motion,
     check_sizes,
+    check_spacing,
     find_exchanges,
-    measure_spacing,
-    sum_squares,
     triangulated_residuals,
 )
 from calib.wand.quality.contradictions import check_mirrored, check_residuals
@@ -77,7 +74,6 @@ BUDGET = 80  # instants that either model of synchronous cameras is fitted to
 MIN_GAIN = 1.1  # ratio of the residuals without and with clock offsets, from which offsets are preferred
 ROLLING = "the rows of rolling shutters are captured one after another, so the wand's motion matters"
 COARSE_SETS, FINE_SETS = 250, 1000  # frame sets of either stage
-WANDS = 3  # that are measured one after the other
 MAX_MEASURED = 20_000  # detections whose residuals are stated
 # Runs of consecutive instants are held out, or fitted, together, so that tracks can be interpolated within them: one in
 # `PARTS` is held out.
@@ -440,8 +436,9 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
         CalibrationError: the wand's lengths do not fit the observations or the roundels' sizes.
         CameraFault: a camera's lens differs from its file, or its observations contradict those of the others.
     """
-    recording, solution = _measure_wand(recording, rough)
+    solution = adjust_coarsely(recording, rough)
     coarse = solution.adjusted
+    check_spacing(coarse)
     check_lenses(recording.names, coarse)
     check_mirrored(recording.wand, coarse)
     try:
@@ -450,7 +447,7 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
             check_residuals(recording, coarse)
         clocks = choose_clocks(coarse, recording.timing)
         fine = _prepare_fine(recording, rough, coarse, clocks)
-        solution = replace(_adjust_finely(fine, coarse.inflation), spacing=solution.spacing)
+        solution = _adjust_finely(fine, coarse.inflation)
         _check_agreement_and_sizes(recording, rough, solution)
         return _validate(recording, solution)
     except CameraFault as fault:
@@ -458,36 +455,6 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
         if jump is None or jump.camera not in fault.reasons:
             raise
         raise CameraFault({jump.camera: jump.sentence()}, fault.certain) from None
-
-
-def _measure_wand(recording: WandRecording, rough: RoughRig) -> tuple[WandRecording, Solution]:
-    """Adjust coarsely; where the wand as the cameras measure it differs from its file, again with that wand.
-
-    The adjustment displaces cameras to reconcile them with a wand that was measured wrong: 5 mm of 0.5 m are 0.1 m. The
-    largest distance between two markers stays as in the file: it is the scale. Each adjustment leaves about a fifth of
-    the error; one that explains the recording no better has measured something else.
-
-    Raises:
-        CalibrationError: the wand differs so much that it is not known which of its distances is right.
-    """
-    solution = adjust_coarsely(recording, rough)
-    spacing = (
-        measure_spacing(recording.wand, solution.adjusted, solution.observations) if rough.metric else None
-    )
-    if spacing is None or spacing.is_explained or spacing.error < MIN_SPACING_ERROR:
-        return recording, solution
-    measured, found, misfit = recording, spacing, sum_squares(solution.adjusted, solution.observations)
-    for _ in range(WANDS):
-        other = replace(recording, wand=found.correct(recording.wand))
-        trial = adjust_coarsely(other, rough)
-        if (better := sum_squares(trial.adjusted, trial.observations)) > misfit:
-            break
-        measured, misfit = other, better
-        found = measure_spacing(recording.wand, trial.adjusted, trial.observations) or found
-        solution = replace(trial, spacing=found)
-    if solution.spacing is not None and found.error > MAX_SPACING_ERROR:
-        raise CalibrationError(f"{found.sentence()}; measure the wand again")
-    return measured, solution
 
 
 def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COARSE_SETS) -> Solution:
@@ -524,7 +491,7 @@ def _prepare_fine(
     lenses = [coarse.state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
     better = replace(rough, cameras=coarse.state.cameras, offset_s=clocks.clocks[:, 0])
     start = _build(recording.undistort_tracks(lenses), better, FINE_SETS)
-    state = replace(start.state, clocks=clocks.clocks, lenses=coarse.state.lenses)
+    state = replace(start.state, clocks=clocks.clocks, lenses=coarse.state.lenses, shape=coarse.state.shape)
     density = acceleration_density(coarse.problem.knot_s, coarse.state.motion[:, 0], recording.timing.gap_s)
     problem = start.problem.with_free(POSE, LENS, *clocks.free)
     problem = replace(problem, density=density, drift_sigma=clocks.drift_sigma)

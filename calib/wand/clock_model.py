@@ -218,7 +218,7 @@ def _confirm(
         drift_sigma=SLEWED_DRIFT,
         background=BackgroundPoints.none(),
     )
-    start = State(state.cameras[split], clocks, state.lenses[split], state.motion)
+    start = State(state.cameras[split], clocks, state.lenses[split], state.motion, state.shape)
     # The time is found along the motion that the other cameras show: that of both parts of the clock bends to the first
     # one.
     is_near = (observations.camera == camera) & (np.abs(observations.t_s - change.t_s) < NEAR_S)

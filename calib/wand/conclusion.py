@@ -15,7 +15,7 @@ from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_cov
 from calib.wand.bundle_adjustment.problem import Adjusted, WandObservations, gauge_directions
 from calib.wand.bundle_adjustment.residuals import point_residuals
 from calib.wand.detections import WandRecording
-from calib.wand.quality.checks import Spacing, measure_lengths
+from calib.wand.quality.checks import Spacing, measure_lengths, measure_spacing
 from calib.wand.quality.lenses import find_lens_changes
 from calib.wand.scale import Distance, DistanceComparison
 from calib.wand.wand_report import (
@@ -45,7 +45,6 @@ class Solution:
         held_out: residuals of a fifth of the instants, at the rig adjusted without these.
         rejected_px: (r,) distances of the rejected observations from where the other cameras see the marker, pixels;
             NaN where none does.
-        spacing: of the wand, where the cameras measure it otherwise than its file has it.
     """
 
     adjusted: Adjusted
@@ -53,7 +52,6 @@ class Solution:
     given: Validation | None = None
     held_out: Validation | None = None
     rejected_px: Array | None = None
-    spacing: Spacing | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +80,11 @@ class Placement:
 def conclude(rig: Rig, solution: Solution, placement: Placement, jump: ClockJump | None) -> WandCalibration:
     """Build the result: the rig in an upright world, clocks relative to their median, and the report."""
     adjusted, observations = solution.adjusted, solution.observations
+    spacing = measure_spacing(adjusted)
     if placement.scaled_by is not None:
         adjusted = add_scale_uncertainty(adjusted, placement.scaled_by.sigma_m / placement.scaled_by.metres)
-    elif solution.spacing is not None:  # any of its distances may be the one that is wrong
-        adjusted = add_scale_uncertainty(adjusted, solution.spacing.error)
+    elif spacing is not None:
+        adjusted = add_scale_uncertainty(adjusted, spacing.scale_sigma)
     covariance = camera_covariance(adjusted)
     offsets, drift, readout = (adjusted.state.clocks * CLOCK_UNITS).T
     variances = np.einsum("cpcp->cp", covariance.of((*OFFSET, *DRIFT, *READOUT)))
@@ -94,7 +93,7 @@ def conclude(rig: Rig, solution: Solution, placement: Placement, jump: ClockJump
     size = 6 * len(placement.recording.names)
     return WandCalibration(
         rig=_place(rig, adjusted, covariance, placement, offsets),
-        report=_build_report(replace(solution, adjusted=adjusted), covariance, placement),
+        report=_build_report(replace(solution, adjusted=adjusted), covariance, placement, spacing),
         names=placement.recording.names,
         adjusted=adjusted,
         observations=observations,
@@ -192,7 +191,9 @@ def _place(
     return move_rig(msgspec.structs.replace(rig, cameras=cameras), T_world)
 
 
-def _build_report(solution: Solution, covariance: CameraCovariance, placement: Placement) -> WandReport:
+def _build_report(
+    solution: Solution, covariance: CameraCovariance, placement: Placement, spacing: Spacing | None
+) -> WandReport:
     adjusted, observations = solution.adjusted, solution.observations
     names, distance = placement.recording.names, placement.compared_with
     lengths, cov = measure_lengths(adjusted, observations), covariance.of(POSE)
@@ -213,7 +214,7 @@ def _build_report(solution: Solution, covariance: CameraCovariance, placement: P
         scaled_by=placement.scaled_by,
         compared=compare_distance(distance, names, adjusted) if distance else None,
         timing=placement.timing,
-        wand=solution.spacing.sentence() if solution.spacing else "",
+        wand=spacing.sentence() if spacing else "",
         adjusted_lenses={
             name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
         },

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Optimizes the cameras, their clocks and lenses, and the wand's motion, with Levenberg-Marquardt.
+"""Optimizes the cameras, their clocks and lenses, and the wand's motion and shape, with Levenberg-Marquardt.
 
 A rough start is optimized robustly by iteratively reweighted least squares: Cauchy's weights at a scale that the
 residuals give. The final estimate is plain least squares without the observations that the statistics reject, with the
 motion profiled out (`ProfiledMotion`): otherwise cameras would be moved to make the wand's path smoother.
 
-The motion is a chain, so its Hessian is block tridiagonal, and one factorization eliminates it for all cameras at once
-(Schur complement). What remains is a graph of the cameras, their information and their priors, which GTSAM solves.
+The motion is a chain, so its Hessian is block tridiagonal, and one factorization eliminates it for all global
+parameters at once (Schur complement): those of the cameras, then the wand's shape. What remains is a graph of these,
+their information and their priors, which GTSAM solves.
 """
 
 from collections.abc import Iterator
@@ -89,6 +90,7 @@ def adjust(
         residuals=reprojection_errors(problem, observations, state),
         scale=_noise_scale(problem, inliers, state, weights),
         information=cameras.information,
+        shape_covariance=cameras.shape_covariance(problem, state),
         scores=cameras.scores,
         background_used=choice.background,
         converged=converged,
@@ -246,25 +248,25 @@ def _profile(objective: _Objective, state: State) -> State | None:
             state, damping = _levenberg_marquardt(path, state, damping)
             norms = objective.norms(state)
             profiled = profile_motion(objective.linearize(state, norms))
-            steps = profiled.step(objective.problem, state, damping)
+            steps, length = profiled.step(objective.problem, state, damping)
         except np.linalg.LinAlgError:
             return None
-        stepped = _step_profiled(objective, state, norms, steps[:2])
-        if stepped is None or steps[2] ** 2 < most * (before - steps[2]):
+        stepped = _step_profiled(objective, state, norms, steps)
+        if stepped is None or length**2 < most * (before - length):
             return stepped
-        state, before, is_near = stepped, min(steps[2], 1.0), steps[2] ** 2 < allowed
+        state, before, is_near = stepped, min(length, 1.0), length**2 < allowed
     return state if is_near else None
 
 
 def _step_profiled(
-    objective: _Objective, state: State, norms: ErrorNorms, steps: tuple[Array, Array]
+    objective: _Objective, state: State, norms: ErrorNorms, steps: tuple[Array, Array, Array]
 ) -> State | None:
-    """Take the `steps` of cameras and motion from a state with residuals `norms`, or a part of them; None where the
-    cost grows much with all parts."""
+    """Take the `steps` of cameras, motion and shape from a state with residuals `norms`, or a part of them; None where
+    the cost grows much with all parts."""
     most = MAX_GROWTH * objective.cost(norms) + 1
     for share in 0.5 ** np.arange(MAX_HALVINGS):
         try:
-            moved = objective.problem.retract(state, share * steps[0], share * steps[1])
+            moved = objective.problem.retract(state, *(share * step for step in steps))
             moved = locate_points(objective.problem, moved, objective.weights.background)
             if objective.cost(objective.norms(moved)) < most:
                 return moved
@@ -291,7 +293,8 @@ def _descend(objective: _Objective, before: _Step) -> _Step | None:
 
 @dataclass(frozen=True, slots=True)
 class ProfiledMotion:
-    """A linear system with the motion replaced by the one that is optimal for the cameras, h = 6 B scalars at a knot.
+    """A linear system with the motion, h = 6 B scalars at a knot, and the wand's shape replaced by those that are
+    optimal for the cameras.
 
     The motion prior chooses that motion, and constrains the cameras no further: it does not know the size of the
     motion, so cameras that make a path smoother are no better (generalized profiling: Ramsay, Hooker, Campbell and Cao,
@@ -299,31 +302,42 @@ class ProfiledMotion:
 
     Attributes:
         information: (S d, S d) on the free parameters of the S estimated cameras, with their priors.
-        scores: (L + J, S d) gradients by interval between knots, then by background point, without the cameras' priors.
-        gradient: (S d,) their sum, with the cameras' priors.
+        scores: (L + J, S d) gradients by interval between knots, then by background point, without priors.
+        gradient: (S d,) their sum, with priors.
+        of_shape, shape_gradient: (n, n) information on the shape, the cameras fixed, and (n,) its gradient.
+        response: (n, S d) what the shape changes less for a change of the cameras.
         sums: the equations before the motion was replaced.
     """
 
     information: Array
     scores: Array
     gradient: Array
+    of_shape: Array
+    shape_gradient: Array
+    response: Array
     sums: "_Sums"
 
-    def step(self, problem: Problem, state: State, damping: float) -> tuple[Array, Array, float]:
-        """The Gauss-Newton step, (C, 18) of the cameras and (K, h) of the motion, which is damped, and how far it is:
-        its Mahalanobis length in the cameras."""
+    def step(
+        self, problem: Problem, state: State, damping: float
+    ) -> tuple[tuple[Array, Array, Array], float]:
+        """The Gauss-Newton step, (C, 18) of the cameras, (K, h) of the motion, which is damped, and (n,) of the shape,
+        and how far it is: its Mahalanobis length in cameras and shape."""
         of_cameras = invert_information(problem, state, self.information) @ self.gradient
-        right = self.sums.gradient - self.sums.crossed @ of_cameras
+        alone = np.linalg.solve(self.of_shape, self.shape_gradient)
+        shape_step = alone - self.response @ of_cameras
+        right = self.sums.gradient - self.sums.crossed @ np.append(of_cameras, shape_step)
         motion_step = self.sums.motion.damp(damping).factorize().solve(right[:, :, None])[:, :, 0]
-        return (
-            _all_parameters(problem, of_cameras),
-            motion_step,
-            float(np.sqrt(abs(of_cameras @ self.gradient))),
-        )
+        squared = abs(of_cameras @ self.gradient) + abs(alone @ self.shape_gradient)
+        return (_all_parameters(problem, of_cameras), motion_step, shape_step), float(np.sqrt(squared))
+
+    def shape_covariance(self, problem: Problem, state: State) -> Array:
+        """(n, n) covariance of the wand's shape."""
+        of_cameras = invert_information(problem, state, self.information)
+        return np.asarray(np.linalg.inv(self.of_shape) + self.response @ of_cameras @ self.response.T, float)
 
 
-def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
-    """Solve for the step of Levenberg-Marquardt: (C, 18) of the cameras and (K, h) of the motion.
+def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array, Array]:
+    """Solve for the step of Levenberg-Marquardt: (C, 18) of the cameras, (K, h) of the motion and (n,) of the shape.
 
     The Hessian's diagonal is multiplied by 1 + `damping` (Marquardt). Where all cameras are estimated, the first camera
     and its clock are fixed (gauge).
@@ -332,41 +346,49 @@ def solve_step(system: LinearSystem, damping: float) -> tuple[Array, Array]:
         RuntimeError, LinAlgError: the system is nearly singular; more damping helps.
     """
     sums = _Sums.of(system)
-    (knots, h), size = sums.gradient.shape, len(sums.of_cameras)
+    (knots, h), size = sums.gradient.shape, len(sums.of_globals)
     motion = sums.motion.damp(damping).factorize()
     right = np.concatenate([sums.crossed, sums.gradient[:, :, None]], axis=2)
     response, motion_step = np.split(motion.solve(right), [size], axis=2)
     crossed = sums.crossed.reshape(knots * h, size)
-    information = sums.of_cameras - crossed.T @ response.reshape(knots * h, size)
-    information += damping * np.diag(np.diag(sums.of_cameras))
+    information = sums.of_globals - crossed.T @ response.reshape(knots * h, size)
+    information += damping * np.diag(np.diag(sums.of_globals))
     gradient = sums.scores.sum(axis=0) - crossed.T @ motion_step.ravel()
-    of_cameras = _solve_cameras(system, information, gradient) if size else gradient
-    return _all_parameters(system.problem, of_cameras), motion_step[:, :, 0] - response @ of_cameras
+    step = _solve_globals(system, information, gradient) if size else gradient
+    of_cameras, of_shape = np.split(step, [size - system.problem.shapes])
+    shape_step = np.zeros(len(system.problem.wand.shapes))
+    shape_step[: len(of_shape)] = of_shape  # 0 where the shape is fixed
+    return _all_parameters(system.problem, of_cameras), motion_step[:, :, 0] - response @ step, shape_step
 
 
-def _solve_cameras(system: LinearSystem, information: Array, gradient: Array) -> Array:
-    """(S d,) the step of the estimated cameras, from their information and gradient, to which their priors are added.
+def _solve_globals(system: LinearSystem, information: Array, gradient: Array) -> Array:
+    """(S d + n,) the step of the estimated cameras and of the wand's shape, from their information and gradient, to
+    which their priors are added.
 
     Raises:
         RuntimeError: the system is nearly singular.
     """
     import gtsam
 
-    free, estimated = list(system.problem.free), list(system.problem.estimated_cameras())
-    d, graph, ordering = len(free), gtsam.GaussianFactorGraph(), gtsam.Ordering()
-    rows, (by_priors, prior_gradient) = system.problem.estimated_rows(), system.priors
-    H = (information + by_priors[np.ix_(rows, rows)]).reshape(len(estimated), d, len(estimated), d)
-    g = (gradient + prior_gradient[rows]).reshape(-1, d)
-    zero, none = np.zeros((d, d)), np.zeros(d)
-    for k in range(len(estimated)):
+    problem, graph, ordering = system.problem, gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    free, count = list(problem.free), len(problem.estimated_cameras())
+    rows, (by_priors, prior_gradient) = problem.global_rows(), system.priors
+    H, g = information + by_priors[np.ix_(rows, rows)], gradient + prior_gradient[rows]
+    parts = np.split(
+        np.arange(len(rows)), len(free) * np.arange(1, count + 1)
+    )  # of each camera, and of the shape
+    parts = parts if problem.shapes else parts[:-1]
+    zeros = [(np.zeros((len(part), len(part))), np.zeros(len(part))) for part in parts]
+    for k, part in enumerate(parts):
         ordering.push_back(k)
-        graph.push_back(gtsam.HessianFactor(k, H[k, :, k], g[k], 0.0))
-    for a, b in combinations(range(len(estimated)), 2):  # only the sum of all is positive definite
-        graph.push_back(gtsam.HessianFactor(a, b, zero, H[a, :, b], none, zero, none, 0.0))
-    if system.problem.estimated is None:
-        graph.push_back(gtsam.HessianFactor(0, np.diag(ANCHOR[free]), none, 0.0))
+        graph.push_back(gtsam.HessianFactor(k, H[np.ix_(part, part)], g[part], 0.0))
+    for a, b in combinations(range(len(parts)), 2):  # only the sum of all is positive definite
+        crossed = H[np.ix_(parts[a], parts[b])]
+        graph.push_back(gtsam.HessianFactor(a, b, zeros[a][0], crossed, zeros[a][1], *zeros[b], 0.0))
+    if problem.estimated is None:
+        graph.push_back(gtsam.HessianFactor(0, np.diag(ANCHOR[free]), zeros[0][1], 0.0))
     step = graph.optimize(ordering)
-    return np.concatenate([step.at(k) for k in range(len(estimated))])
+    return np.concatenate([step.at(k) for k in range(len(parts))])
 
 
 def _all_parameters(problem: Problem, of_cameras: Array) -> Array:
@@ -377,25 +399,23 @@ def _all_parameters(problem: Problem, of_cameras: Array) -> Array:
 
 
 def profile_motion(system: LinearSystem) -> ProfiledMotion:
-    """Eliminate the motion.
+    """Eliminate the motion, then the wand's shape.
 
     With H the Hessian, g the gradient and P the Hessian of the motion prior, the response of the motion is
     G = H_mm^-1 H_mc, and the derivatives of the observations by the cameras, along the optimal motion, are
     D = J_c - J_m G. A smooth path is shorter than the true one, and cameras that make it longer fit better. So the
     residuals r are fitted once more, r - J_m H_mm^-1 J_m^T r, before they are compared with D (twicing: Newey, Hsieh
     and Robins, Econometrica 72, 2004). With J_m^T D = P G the score is D^T r - (P G)^T H_mm^-1 J_m^T r, and the
-    information H_cc - G^T (H_mc + P G) - (P G)^T H_mm^-1 P G.
+    information H_cc - G^T (H_mc + P G) - (P G)^T H_mm^-1 P G. Of the shape, the Schur complement is taken of these.
 
     Raises:
         LinAlgError: the motion's Hessian is not positive definite.
     """
-    sums, prior = _Sums.of(system), system.motion_prior[:, :-1, :-1]
-    (knots, h), size = sums.gradient.shape, len(sums.of_cameras)
+    sums = _Sums.of(system)
+    h, size = sums.gradient.shape[1], len(sums.of_globals)
+    prior = system.motion_prior[:, : 2 * h, : 2 * h]
     motion = sums.motion.factorize()
-    observed = np.zeros((knots, h))
-    observed[:-1] += sums.observed[:, :h]
-    observed[1:] += sums.observed[:, h:]
-    right = np.concatenate([sums.crossed, observed[:, :, None]], axis=2)
+    right = np.concatenate([sums.crossed, _add_ends(sums.observed[:, :, None])], axis=2)
     G, again = np.split(motion.solve(right), [size], axis=2)
     by_prior = BlockTridiagonal.of_chain(prior).multiply(G)
     along, twice = (sums.crossed + by_prior).reshape(-1, size), motion.solve(by_prior).reshape(-1, size)
@@ -403,12 +423,19 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     pulled = sums.observed + (prior @ np.concatenate([again[:-1], again[1:]], axis=1))[:, :, 0]
     scores = sums.scores.copy()
     scores[: len(pulled)] -= (pulled[:, None, :h] @ G[:-1] + pulled[:, None, h:] @ G[1:])[:, 0]
-    information = sums.of_cameras - G.reshape(-1, size).T @ along - by_prior.reshape(-1, size).T @ twice
-    rows, (by_priors, gradient) = system.problem.estimated_rows(), system.priors
+    information = sums.of_globals - G.reshape(-1, size).T @ along - by_prior.reshape(-1, size).T @ twice
+    rows, (by_priors, prior_gradient) = system.problem.global_rows(), system.priors
+    H, gradient = information + by_priors[np.ix_(rows, rows)], scores.sum(axis=0) + prior_gradient[rows]
+    cameras = size - system.problem.shapes
+    of_shape, crossed = H[cameras:, cameras:], H[cameras:, :cameras]
+    response = np.asarray(np.linalg.solve(of_shape, crossed), float)
     return ProfiledMotion(
-        information=information + by_priors[np.ix_(rows, rows)],
-        scores=scores,
-        gradient=scores.sum(axis=0) + gradient[rows],
+        information=H[:cameras, :cameras] - crossed.T @ response,
+        scores=scores[:, :cameras] - scores[:, cameras:] @ response,
+        gradient=gradient[:cameras] - gradient[cameras:] @ response,
+        of_shape=of_shape,
+        shape_gradient=gradient[cameras:],
+        response=response,
         sums=sums,
     )
 
@@ -489,15 +516,16 @@ class BlockFactors:
 
 @dataclass(frozen=True, slots=True)
 class _Sums:
-    """The normal equations of all residuals.
+    """The normal equations of all residuals, without the priors of the global parameters: of the S estimated cameras,
+    and of the wand's shape.
 
     Attributes:
         motion: Hessian of the motion.
         gradient: (K, h) of the motion, by knot.
         observed: (L, 2 h) of the motion, by interval, without the motion prior.
-        crossed: (K, h, S d) products of the derivatives by the motion and by the cameras.
-        scores: (L + J, S d) gradients of the cameras, by interval, then by background point, without priors.
-        of_cameras: (S d, S d) Hessian of the cameras, with background points, without priors.
+        crossed: (K, h, S d + n) products of the derivatives by the motion and by the global parameters.
+        scores: (L + J, S d + n) gradients of the global parameters, by interval, then by background point.
+        of_globals: (S d + n, S d + n) Hessian of the global parameters, with background points.
     """
 
     motion: BlockTridiagonal
@@ -505,68 +533,84 @@ class _Sums:
     observed: Array
     crossed: Array
     scores: Array
-    of_cameras: Array
+    of_globals: Array
 
     @classmethod
     def of(cls, system: LinearSystem) -> "_Sums":
-        local, d = 12 * len(system.problem.wand.basis), len(system.problem.free)
-        estimated, knots, h = list(system.problem.estimated_cameras()), len(system.chain) + 1, local // 2
-        size = len(estimated) * d
-        motion = _sum_motion(system, local)
-        gradient = np.zeros((knots, h))
-        gradient[:-1] += motion[:, :h, -1]
-        gradient[1:] += motion[:, h:, -1]
-        crossed, scores = _sum_cameras(system, local)
-        beside = system.point_scores[:, estimated].reshape(len(system.point_scores), size)
+        h = 6 * len(system.problem.wand.basis)
+        chain = _sum_chain(system)
+        by_cameras, shape_by_cameras, camera_scores = _sum_cameras(system)
+        of_cameras, of_shape = _sum_camera_hessians(system), chain[:, 2 * h : -1, 2 * h : -1].sum(axis=0)
+        shape_scores = np.zeros((len(camera_scores), len(of_shape)))
+        shape_scores[: len(chain)] = chain[:, 2 * h : -1, -1]
         return cls(
-            motion=BlockTridiagonal.of_chain(motion[:, :, :-1]),
-            gradient=gradient,
-            observed=motion[:, :, -1] - system.motion_prior[:, :-1, -1],
-            crossed=crossed.reshape(knots, h, size),
-            scores=np.concatenate([scores.reshape(knots - 1, size), beside]),
-            of_cameras=_sum_camera_hessians(system, local).reshape(size, size),
+            motion=BlockTridiagonal.of_chain(chain[:, : 2 * h, : 2 * h]),
+            gradient=_add_ends(chain[:, : 2 * h, -1:])[:, :, 0],
+            observed=chain[:, : 2 * h, -1] - system.motion_prior[:, : 2 * h, -1],
+            crossed=np.concatenate([by_cameras, _add_ends(chain[:, : 2 * h, 2 * h : -1])], axis=2),
+            scores=np.concatenate([camera_scores, shape_scores], axis=1),
+            of_globals=np.block([[of_cameras, shape_by_cameras.T], [shape_by_cameras, of_shape]]),
         )
 
 
-def _sum_motion(system: LinearSystem, local: int) -> Array:
-    """(L, 2 h, 2 h + 1) Hessians and gradients of the motion, by interval."""
-    motion = system.chain[:, :local].copy()
+def _add_ends(parts: Array) -> Array:
+    """(K, h, n) sums by knot of parts (K - 1, 2 h, n), each of a knot and the next."""
+    h = parts.shape[1] // 2
+    sums = np.zeros((len(parts) + 1, h, parts.shape[2]))
+    sums[:-1] += parts[:, :h]
+    sums[1:] += parts[:, h:]
+    return sums
+
+
+def _sum_chain(system: LinearSystem) -> Array:
+    """`LinearSystem.chain` with the observations."""
+    chain, d = system.chain.copy(), len(system.problem.free)
     interval = system.views // len(system.problem.lenses)
     first = np.flatnonzero(np.diff(interval, prepend=-1))
     for part, rows in _equal_blocks(system.rows, np.append(system.bounds[first], system.bounds[-1])):
-        at, J = interval[first[part]], rows[:, :, :local]
-        motion[at, :, :local] += J.mT @ J
-        motion[at, :, local:] += J.mT @ rows[:, :, -1:]
-    return motion
+        chain[interval[first[part]]] += rows[:, :, d:].mT @ rows[:, :, d:]
+    return chain
 
 
-def _sum_cameras(system: LinearSystem, local: int) -> tuple[Array, Array]:
-    """(K, h, S, d) products of the derivatives by the motion and by the estimated cameras, and (L, S, d) scores."""
-    estimated, h, L = list(system.problem.estimated_cameras()), local // 2, len(system.chain)
-    crossed = np.zeros((L + 1, h, len(estimated), len(system.problem.free)))
-    scores = np.zeros((L, *crossed.shape[2:]))
+def _sum_cameras(system: LinearSystem) -> tuple[Array, Array, Array]:
+    """Products (K, h, S d) of the derivatives by the motion and (n, S d) by the shape with those by the estimated
+    cameras, and the scores (L + J, S d) of these."""
+    estimated, n, d = (
+        list(system.problem.estimated_cameras()),
+        system.problem.shapes,
+        len(system.problem.free),
+    )
+    L, h, size = len(system.chain), 6 * len(system.problem.wand.basis), len(estimated) * d
+    crossed, by_shape = np.zeros((L + 1, h, len(estimated), d)), np.zeros((len(estimated), n, d))
+    scores = np.zeros((L, len(estimated), d))
     slot = np.full(len(system.problem.lenses), -1)
     slot[estimated] = np.arange(len(estimated))
     interval, camera = np.divmod(system.views, len(slot))
     for part, rows in _equal_blocks(system.rows, system.bounds):
         mine = slot[camera[part]] >= 0
         at, of, J = interval[part[mine]], slot[camera[part[mine]]], rows[mine]
-        by_both = J[:, :, :local].mT @ J[:, :, local:-1]
+        by_both = J[:, :, d:].mT @ J[:, :, :d]
         crossed[at, :, of] += by_both[:, :h]
-        crossed[at + 1, :, of] += by_both[:, h:]
-        scores[at, of] = (J[:, :, -1:].mT @ J[:, :, local:-1])[:, 0]
-    return crossed, scores
+        crossed[at + 1, :, of] += by_both[:, h : 2 * h]
+        np.add.at(by_shape, of, by_both[:, 2 * h : -1])
+        scores[at, of] = by_both[:, -1]
+    beside = system.point_scores[:, estimated]
+    return (
+        crossed.reshape(L + 1, h, size),
+        np.swapaxes(by_shape, 0, 1).reshape(n, size),
+        np.concatenate([scores, beside]).reshape(L + len(beside), size),
+    )
 
 
-def _sum_camera_hessians(system: LinearSystem, local: int) -> Array:
-    """(S, d, S, d) Hessian of the cameras, with background points, without priors."""
+def _sum_camera_hessians(system: LinearSystem) -> Array:
+    """(S d, S d) Hessian of the cameras, with background points, without priors."""
     estimated, d = list(system.problem.estimated_cameras()), len(system.problem.free)
     of_row = np.repeat(system.views % len(system.problem.lenses), np.diff(system.bounds))
     own = system.by_points[np.ix_(estimated, range(d), estimated, range(d))]
     for k, camera in enumerate(estimated):
-        J = system.rows[of_row == camera, local:-1]
+        J = system.rows[of_row == camera, :d]
         own[k, :, k] += J.T @ J
-    return own
+    return np.asarray(own.reshape(len(estimated) * d, len(estimated) * d), float)
 
 
 def _equal_blocks(rows: Array, bounds: Index) -> Iterator[tuple[Index, Array]]:

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.camera import FLAT, LENS, PER_CAMERA, POSE, with_distortion
+from calib.rig.camera import FLAT, LENS, PER_CAMERA, POSE, span_dimension, with_distortion
 from calib.wand.detections import MarkerImages
 from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.body import Body
@@ -19,6 +19,9 @@ POSE_SIGMA, OFFSET_SIGMA = [np.inf] * 6, [0.5]
 READOUT_SIGMA = 0.02  # of the readout time, beside what is given, s: rolling shutters take 5 to 40 ms
 # And of the clock's drift, s/s: of a clock that a time service slews, and of a free-running crystal (50 ppm at most).
 SLEWED_DRIFT, CRYSTAL_DRIFT = 5e-4, 3e-5
+# Of a marker's place in the wand's file, as a share of the wand's size: a millimetre of half a metre.
+SHAPE_SIGMA = 0.002
+MAX_SHAPED = 32  # markers of a wand whose places are estimated: the errors of more average out
 SHAKE_ITERATIONS = 4  # that satisfy several lengths together
 
 
@@ -37,15 +40,20 @@ class WandObservations(MarkerImages):
 
 @dataclass(frozen=True, slots=True)
 class AffineWand:
-    """Markers as combinations of basis markers.
+    """Markers as combinations of basis markers, and the shapes that the wand may have.
 
     Attributes:
+        points: (M, 3) the markers, metres.
+        shapes: (n, M, 3) orthonormal displacements of all markers, within the line, plane or space that they span, that
+            neither move, nor turn, nor scale the wand.
         basis: (B,) indices of the basis markers: 1, 2 on a line, 3 in a plane or 4.
         weights: (M, B) rows that sum to 1; marker k = weights[k] @ basis points.
         pairs: (E, 2) pairs of basis markers, as indices into `basis`.
         lengths: (E,) their distances, metres.
     """
 
+    points: Array
+    shapes: Array
     basis: Index
     weights: Array
     pairs: Index
@@ -65,12 +73,49 @@ class AffineWand:
             if (distance := np.linalg.norm(off, axis=0)).max() < FLAT * extent:
                 break
             basis.append(int(distance.argmax()))
-        system = np.vstack([points[basis].T, np.ones(len(basis))])
-        weights = np.linalg.lstsq(system, np.vstack([points.T, np.ones(len(points))]), rcond=None)[0].T
+        return cls._at(points, _shapes(points), np.array(basis))
+
+    @classmethod
+    def _at(cls, points: Array, shapes: Array, basis: Index) -> "AffineWand":
+        weights = np.vstack([points.T, np.ones(len(points))]).T @ _coordinates(points[basis]).T
         pairs = np.array(list(combinations(range(len(basis)), 2)), np.intp).reshape(-1, 2)
         ends = points[basis][pairs]
         lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-        return cls(np.array(basis), np.asarray(weights, float), pairs, lengths)
+        return cls(points, shapes, basis, weights, pairs, lengths)
+
+    def displaced(self, shape: Array) -> "AffineWand":
+        """The wand with its markers displaced by a combination (n,) of its `shapes`."""
+        if not shape.any():
+            return self
+        return self._at(self.points + np.tensordot(shape, self.shapes, 1), self.shapes, self.basis)
+
+    def jacobians(self) -> tuple[Array, Array]:
+        """Derivatives of the weights (n, M, B) and of the lengths (n, E) by the combination of `shapes`."""
+        moved = self.shapes[:, self.basis]
+        # Weights w of a marker p in the basis A: A w = (p, 1), so A dw = (dp - dA w, 0).
+        by_weights = (self.shapes - self.weights @ moved) @ _coordinates(self.points[self.basis])[:, :3].T
+        (first, second), ends = self.pairs.T, self.points[self.basis]
+        along = (ends[first] - ends[second]) / self.lengths[:, None]
+        return by_weights, ((moved[:, first] - moved[:, second]) * along).sum(axis=2)
+
+
+def _coordinates(basis: Array) -> Array:
+    """(B, 4) the affine coordinates of homogeneous points, in the span of a basis (B, 3)."""
+    return np.asarray(np.linalg.pinv(np.vstack([basis.T, np.ones(len(basis))])), float)
+
+
+def _shapes(points: Array) -> Array:
+    """`AffineWand.shapes` of points (M, 3)."""
+    count, dimension = len(points), span_dimension(points)
+    if not 2 < count <= MAX_SHAPED:
+        return np.zeros((0, count, 3))
+    off = points - points.mean(axis=0)
+    axes = np.linalg.svd(off)[2][:dimension]
+    within, units = off @ axes.T, np.eye(dimension)
+    turns = [np.outer(a, b) - np.outer(b, a) for a, b in combinations(units, 2)]
+    similar = [np.tile(unit, (count, 1)) for unit in units] + [within @ turn for turn in turns] + [within]
+    rest = np.linalg.svd(np.reshape(similar, (len(similar), -1)))[2][len(similar) :]
+    return np.asarray(rest.reshape(-1, count, dimension) @ axes, float)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +158,7 @@ class State:
         clocks: (C, 3) time offset, s, drift, s/s, and readout time beside the given one, s (`true_times`).
         lenses: (C, 9) corrections of the lenses' parameters (`calib.rig.camera.LENS`).
         motion: (K, 2, B, 3) positions and velocities of the wand's basis markers at the knots, world.
+        shape: (n,) displacement of the wand's markers from their places in its file, metres (`AffineWand.shapes`).
         points: (J, 3) positions of the background points, world.
     """
 
@@ -120,24 +166,26 @@ class State:
     clocks: Array
     lenses: Array
     motion: Array
+    shape: Array
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
-    def of(cls, cameras: Array, offset_s: Array, motion: Array) -> "State":
-        """The state with these cameras, time offsets and motion; no drift, and no correction of the lenses."""
+    def of(cls, cameras: Array, offset_s: Array, motion: Array, shapes: int = 0) -> "State":
+        """The state with these cameras, time offsets and motion; no drift, no correction of the lenses, and the wand
+        as in its file, which has a number of `shapes`."""
         clocks = np.column_stack([offset_s, np.zeros((len(cameras), 2))])
-        return cls(cameras, clocks, np.zeros((len(cameras), len(LENS))), motion)
+        return cls(cameras, clocks, np.zeros((len(cameras), len(LENS))), motion, np.zeros(shapes))
 
-    def retract(self, camera_step: Array, motion_step: Array) -> "State":
-        """Add a step: (C, 18) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion.
-        Points follow from the cameras (`eliminated_points`)."""
+    def retract(self, camera_step: Array, motion_step: Array, shape_step: Array) -> "State":
+        """Add a step: (C, 18) of the cameras, rotation and translation in their own frames, (K, 6 B) of the motion, and
+        (n,) of the wand's shape. Points follow from the cameras (`eliminated_points`)."""
         cameras = self.cameras.copy()
         for T, xi in zip(cameras, camera_step, strict=True):
             T[:3, 3] += T[:3, :3] @ xi[3:6]
             T[:3, :3] = T[:3, :3] @ rotation_from_vector(xi[:3])
         clocks, lenses = self.clocks + camera_step[:, 6:9], self.lenses + camera_step[:, 9:]
         motion = self.motion + motion_step.reshape(self.motion.shape)
-        return State(cameras, clocks, lenses, motion, self.points)
+        return State(cameras, clocks, lenses, motion, self.shape + shape_step, self.points)
 
     def true_times(self, observations: MarkerImages, middle_s: float) -> Array:
         """(n,) true capture times: stamp + offset + drift (stamp - `middle_s`) + readout time x height in the image."""
@@ -165,7 +213,7 @@ class Problem:
 
     Attributes:
         lenses: given lenses of the C cameras.
-        wand: in affine coordinates.
+        wand: as in its file.
         knot_s: (K,) ascending, K >= 2.
         gap_s: longest interval between knots over which the motion prior holds.
         density: power spectral density of the wand's acceleration, m^2/s^3.
@@ -174,7 +222,8 @@ class Problem:
         readout_s: (C,) given readout times, which the stamps of observations contain.
         free: indices of the camera parameters that are estimated (`calib.rig.camera`).
         fixed_distance: two cameras and their distance, where no wand length fixes the scale.
-        estimated: cameras that are estimated, the others are fixed; None for all.
+        estimated: cameras that are estimated, the others are fixed; None for all. Without any, the wand's shape is
+            fixed, too.
         covariance_lens_sigma: (C, 9) prior standard deviations for the covariance; `lens_sigma` if None.
         drift_sigma: prior standard deviation of the clocks' drift, s/s.
         background: images of the background points.
@@ -208,22 +257,36 @@ class Problem:
         """Indices of the S cameras that are estimated."""
         return tuple(range(len(self.lenses))) if self.estimated is None else self.estimated
 
+    @property
+    def shapes(self) -> int:
+        """The number of estimated parameters of the wand's shape."""
+        return 0 if self.estimated == () else len(self.wand.shapes)
+
+    def shape_sigma(self) -> float:
+        """Prior standard deviation of the wand's shape, metres."""
+        return SHAPE_SIGMA * float(self.wand.lengths.max(initial=0.0))
+
     def estimated_rows(self) -> Index:
         """(S d,) the free parameters of the estimated cameras among those (C d,) of all."""
         d = len(self.free)
         return np.ravel(np.array(self.estimated_cameras(), np.intp)[:, None] * d + np.arange(d))
 
+    def global_rows(self) -> Index:
+        """(S d + n,) those parameters of the cameras and of the wand's shape that are estimated, of all (C d + n,)."""
+        cameras = len(self.lenses) * len(self.free)
+        return np.append(self.estimated_rows(), cameras + np.arange(self.shapes))
+
     def with_free(self, *parameters: tuple[int, ...]) -> "Problem":
         """The problem with these groups of camera parameters free."""
         return replace(self, free=tuple(sorted(sum(parameters, ()))))
 
-    def retract(self, state: State, camera_step: Array, motion_step: Array) -> State:
+    def retract(self, state: State, camera_step: Array, motion_step: Array, shape_step: Array) -> State:
         """Add a step along the curve on which lengths change as along the tangent.
 
         In a straight step, a rotation would lengthen a stiff wand, and a translation the distance that fixes the
         scale, by the square of the step.
         """
-        trial = state.retract(camera_step, motion_step)
+        trial = state.retract(camera_step, motion_step, shape_step)
         return self._restore_scale(replace(trial, motion=self._restore_lengths(state.motion, trial.motion)))
 
     def _restore_lengths(self, before: Array, after: Array) -> Array:
@@ -290,6 +353,7 @@ class Adjusted:
         scale: ratio of the residuals to their assumed standard deviations, the square root of the variance factor.
         information: (S d, S d) of the S estimated cameras' free parameters at the assumed noise, with priors. Its null
             space is the gauge: the choice of the world, and of the time that clocks are relative to.
+        shape_covariance: (n, n) of the wand's shape, at the assumed noise.
         scores: (L + J, S d) gradients by interval between knots, then by background point, without priors.
         background_used: images of background points that were not rejected.
         converged: whether the motion could be profiled out: it can't where the cameras contradict each other.
@@ -302,6 +366,7 @@ class Adjusted:
     residuals: Array
     scale: float
     information: Array
+    shape_covariance: Array
     scores: Array
     background_used: Mask
     converged: bool

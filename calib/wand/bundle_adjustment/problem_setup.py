@@ -85,7 +85,8 @@ def build_problem(recording: WandRecording, cameras: Array, offset_s: Array, bud
         readout_s=recording.readout_s,
     )
     motion = np.stack([basis, finite_velocities(knot_s, basis, gap_s)], axis=1)
-    return Estimate(problem, State.of(cameras, offset_s, motion), _observations(recording, rows, knot))
+    state = State.of(cameras, offset_s, motion, len(wand.shapes))
+    return Estimate(problem, state, _observations(recording, rows, knot))
 
 
 def _locate_missing(

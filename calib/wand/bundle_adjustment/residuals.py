@@ -2,9 +2,10 @@
 """The residuals of the wand's bundle adjustment, what whitens them, and their derivatives.
 
 Residuals are the reprojection errors of marker centres at their own capture times, deviations of the motion from
-constant velocity, of the wand from its lengths, and of cameras from their priors. `linearize` differentiates all of
-them in one NumPy batch: every observation depends on one camera and on the two knots around its time. The observations
-of one camera between two knots are a `view`: rows of derivatives by the knot, the next knot and the camera.
+constant velocity, of the wand from its lengths, and of cameras and the wand's shape from their priors. `linearize`
+differentiates all of them in one NumPy batch: every observation depends on one camera, on the shape, and on the two
+knots around its time. The observations of one camera between two knots are a `view`: rows of derivatives by the camera,
+the knot, the next knot and the shape.
 
 Background points are eliminated, so that they constrain the cameras only. Their positions are optimal for the cameras
 of every state (variable projection: Golub and Pereyra 1973), and the Schur complement of each point leaves the cameras
@@ -18,7 +19,13 @@ import numpy as np
 from calib.rig.camera import LENS, PER_CAMERA, POSE, pixel_jacobians
 from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_cost, cauchy_weights, coordinate_sigma
 from calib.rig.triangulation import intersect_images
-from calib.wand.bundle_adjustment.problem import BackgroundPoints, Problem, State, WandObservations
+from calib.wand.bundle_adjustment.problem import (
+    AffineWand,
+    BackgroundPoints,
+    Problem,
+    State,
+    WandObservations,
+)
 from calib.wand.trajectory import (
     SplineLocation,
     locate,
@@ -110,12 +117,14 @@ class MarkerMotion:
         location: of these among the knots.
         hermite: (n, 4) weights of p0, v0, p1, v1 in the position.
         ends: (n, 4, 3) the marker's p0, v0, p1, v1, world.
+        wand: of the state's shape.
     """
 
     t_s: Array
     location: SplineLocation
     hermite: Array
     ends: Array
+    wand: AffineWand
 
     @property
     def points(self) -> Array:
@@ -133,9 +142,9 @@ def predict_markers(problem: Problem, observations: WandObservations, state: Sta
     t_s = state.true_times(observations, problem.middle_s)
     location = locate(knot_s, t_s, problem.gap_s)
     ends = np.concatenate([motion[location.interval], motion[location.interval + 1]], axis=1)
-    weights = problem.wand.weights[observations.label]
-    marker = (weights[:, None, None] @ ends)[:, :, 0]
-    return MarkerMotion(t_s, location, position_weights(knot_s, t_s, location), marker)
+    wand = problem.wand.displaced(state.shape)
+    marker = (wand.weights[observations.label][:, None, None] @ ends)[:, :, 0]
+    return MarkerMotion(t_s, location, position_weights(knot_s, t_s, location), marker, wand)
 
 
 def reprojection_errors(problem: Problem, observations: WandObservations, state: State) -> Array:
@@ -179,7 +188,7 @@ def point_jacobians(lenses: list[Lens], cameras: Array, camera: Index, points: A
 
 def motion_errors(problem: Problem, state: State, weights: Weights) -> tuple[Array, Array, Array]:
     """Whitened deviations from constant velocity (L, 2, B, 3), wand lengths (K, E) and zero speed (K, B, 3)."""
-    wand, motion = problem.wand, state.motion
+    wand, motion = problem.wand.displaced(state.shape), state.motion
     pairs = np.concatenate([motion[:-1], motion[1:]], axis=1)
     ends = motion[:, 0][:, wand.pairs]
     lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
@@ -187,26 +196,29 @@ def motion_errors(problem: Problem, state: State, weights: Weights) -> tuple[Arr
     return smooth, (lengths - wand.lengths) / LENGTH_SIGMA_M, motion[:, 1] / SPEED_SIGMA
 
 
-def camera_priors(problem: Problem, state: State) -> tuple[Array, Array, float]:
-    """The priors of all cameras' free parameters, and of the distance that fixes the scale, at a state.
+def global_priors(problem: Problem, state: State) -> tuple[Array, Array, float]:
+    """The priors of all cameras' free parameters, of the wand's shape, and of the distance that fixes the scale, at a
+    state.
 
     Returns:
-        their information (C d, C d), their gradient (C d,), and the sum of their squared errors in sigmas.
+        their information (C d + n, C d + n), their gradient (C d + n,), and the sum of their squared errors in sigmas.
     """
-    free, poses = list(problem.free), np.zeros((len(state.cameras), len(POSE)))
-    values = np.column_stack([poses, state.clocks, state.lenses])[:, free].ravel()
-    sigma = problem.prior_sigma().ravel()
+    free, poses, n = list(problem.free), np.zeros((len(state.cameras), len(POSE))), problem.shapes
+    of_cameras = np.column_stack([poses, state.clocks, state.lenses])[:, free]
+    values = np.append(of_cameras, state.shape[:n])
+    sigma = np.append(problem.prior_sigma(), np.full(n, problem.shape_sigma()))
     information, gradient = np.diag(sigma**-2), -values / sigma**2
     squares = float(((values / sigma) ** 2).sum())
     if problem.fixed_distance:
         a, b, distance = problem.fixed_distance
         gap = state.cameras[a, :3, 3] - state.cameras[b, :3, 3]
         along = gap / np.linalg.norm(gap) / distance / SCALE_SIGMA
-        J = np.zeros((len(state.cameras), len(free)))
-        J[a, 3:6], J[b, 3:6] = along @ state.cameras[a, :3, :3], -along @ state.cameras[b, :3, :3]
+        by_pose = np.zeros(of_cameras.shape)
+        by_pose[a, 3:6], by_pose[b, 3:6] = along @ state.cameras[a, :3, :3], -along @ state.cameras[b, :3, :3]
+        J = np.append(by_pose, np.zeros(n))
         error = (1 - float(np.linalg.norm(gap)) / distance) / SCALE_SIGMA
         information += np.outer(J, J)
-        gradient += J.ravel() * error
+        gradient += J * error
         squares += error**2
     return information, gradient, squares
 
@@ -247,7 +259,7 @@ def error_norms(
     size = 6 * len(problem.wand.basis)
     interval = np.sqrt((smooth**2).sum(axis=(1, 2, 3)) / size)
     beside = point_error_norms(problem, state)[weights.background]
-    rest = sum((term**2).sum() for term in (lengths, speed, beside)) + camera_priors(problem, state)[2]
+    rest = sum((term**2).sum() for term in (lengths, speed, beside)) + global_priors(problem, state)[2]
     pixel = whitened_errors(problem, observations, state, weights)
     return ErrorNorms(np.linalg.norm(pixel, axis=1), interval, size, float(rest))
 
@@ -259,14 +271,14 @@ class LinearSystem:
     Attributes:
         problem: that was linearized.
         views: (V,) interval between knots times C plus camera, ascending.
-        rows: (2n, m) sorted by view: whitened derivatives by the first knot (6 B), the next knot (6 B) and the
-            camera's free parameters (d), and the whitened residual.
+        rows: (2n, m) sorted by view: whitened derivatives by the camera's free parameters (d), the first knot and the
+            next one (12 B) and the wand's shape (n), and the whitened residual.
         bounds: (V + 1,) the first row of each view, and the number of rows.
-        chain: (L, 12 B + 1, 12 B + 1) augmented Hessians of the motion terms, by interval: knot k's own terms are in
-            interval k, the last knot's in the last interval.
-        motion_prior: (L, 12 B + 1, 12 B + 1) the part of `chain` from the prior of the motion: constant velocity and
-            zero speed.
-        priors: information (C d, C d) and gradient (C d,) of the priors of all cameras.
+        chain: (L, 12 B + n + 1, 12 B + n + 1) augmented Hessians of the motion terms by both knots and the shape, of
+            each interval: knot k's own terms are in interval k, the last knot's in the last interval.
+        motion_prior: (L, 12 B + n + 1, 12 B + n + 1) the part of `chain` from the prior of the motion: constant
+            velocity and zero speed.
+        priors: information (C d + n, C d + n) and gradient (C d + n,) of the priors of all cameras and of the shape.
         by_points, point_scores: (C, d, C, d) information of all background points on the cameras, and (J, C, d)
             gradients by point, the points eliminated.
     """
@@ -289,10 +301,12 @@ def linearize(
     motion = predict_markers(problem, observations, state)
     error, J_camera, J_point = reprojection_jacobians(problem, observations, state, motion)
     root = np.sqrt(weights.observation)[:, None, None] * weights.pixel
-    of_basis = problem.wand.weights[observations.label]
+    of_basis = motion.wand.weights[observations.label]
     by_basis = (motion.hermite[:, :, None] * of_basis[:, None]).reshape(len(error), 1, -1, 1)
-    J_knots = (by_basis * (root @ J_point)[:, :, None]).reshape(len(error), 2, -1)
-    rows = np.concatenate([J_knots, root @ J_camera, root @ error[:, :, None]], axis=2)
+    J_point = root @ J_point
+    J_knots = (by_basis * J_point[:, :, None]).reshape(len(error), 2, -1)
+    J_shape = _by_shape(problem, observations, state, motion, J_point)
+    rows = np.concatenate([root @ J_camera, J_knots, J_shape, root @ error[:, :, None]], axis=2)
     view = motion.location.interval * len(problem.lenses) + observations.camera
     order = np.argsort(view, kind="stable")
     first = np.flatnonzero(np.diff(view[order], prepend=-1))
@@ -305,7 +319,7 @@ def linearize(
         bounds=2 * np.append(first, len(view)),
         chain=motion_prior + _linearize_lengths(problem, state),
         motion_prior=motion_prior,
-        priors=camera_priors(problem, state)[:2],
+        priors=global_priors(problem, state)[:2],
         by_points=by_points,
         point_scores=point_scores,
     )
@@ -334,43 +348,60 @@ def reprojection_jacobians(
     return error, J_camera[:, :, list(problem.free)], J_point
 
 
+def _by_shape(
+    problem: Problem, observations: WandObservations, state: State, motion: MarkerMotion, J_point: Array
+) -> Array:
+    """(n, 2, shapes) derivatives of the predicted pixels by the wand's shape, from those by the marker's position."""
+    if not problem.shapes:
+        return np.zeros((len(observations), 2, 0))
+    first = motion.location.interval
+    ends = np.concatenate([state.motion[first], state.motion[first + 1]], axis=1)
+    basis = np.einsum("ni,nibx->nbx", motion.hermite, ends)
+    by_weights = motion.wand.jacobians()[0][:, observations.label]
+    return np.asarray(np.einsum("npx,snb,nbx->nps", J_point, by_weights, basis, optimize=True), float)
+
+
 def _linearize_prior(problem: Problem, state: State, weights: Weights) -> Array:
     """`LinearSystem.motion_prior`: constant velocity between knots, and zero speed at each."""
-    B, K = len(problem.wand.basis), len(state.motion)
+    B, K, n = len(problem.wand.basis), len(state.motion), problem.shapes
     local = 12 * B
     smooth, _, speed = motion_errors(problem, state, weights)
-    chain = np.zeros((K - 1, local + 1, local + 1))
     weighted = weights.interval[:, None, None] * weights.motion
     H = np.einsum("lri,lrj->lij", weighted, weights.motion)
-    chain[:, :local, :local] = np.kron(H, np.eye(3 * B)[None])
-    chain[:, :local, -1] = -np.einsum("lri,lrbx->libx", weighted, smooth).reshape(K - 1, local)
-    H, g = np.diag(np.repeat([0.0, SPEED_SIGMA**-2], 3 * B)), np.zeros((K, 2, 3 * B))
-    g[:, 1] = -speed.reshape(K, -1) / SPEED_SIGMA
-    return _add_to_knots(chain, np.broadcast_to(H, (K, *H.shape)), g.reshape(K, -1))
+    of_speed, g = np.repeat([0.0, SPEED_SIGMA**-2, 0.0], [3 * B, 3 * B, n]), np.zeros((K, 6 * B + n))
+    g[:, 3 * B : 6 * B] = -speed.reshape(K, -1) / SPEED_SIGMA
+    chain = _sum_knots(np.broadcast_to(np.diag(of_speed), (K, 6 * B + n, 6 * B + n)), g, 6 * B)
+    chain[:, :local, :local] += np.kron(H, np.eye(3 * B)[None])
+    chain[:, :local, -1] -= np.einsum("lri,lrbx->libx", weighted, smooth).reshape(K - 1, local)
+    return chain
 
 
 def _linearize_lengths(problem: Problem, state: State) -> Array:
     """The part of `LinearSystem.chain` from the wand's lengths, and the damping."""
-    B, (K, local) = len(problem.wand.basis), (len(state.motion), 12 * len(problem.wand.basis))
-    gap = state.motion[:, 0][:, problem.wand.pairs]
+    wand, K = problem.wand.displaced(state.shape), len(state.motion)
+    B, E, n = len(wand.basis), len(wand.pairs), problem.shapes
+    gap = state.motion[:, 0][:, wand.pairs]
     gap = gap[:, :, 0] - gap[:, :, 1]
     length = np.linalg.norm(gap, axis=2)
-    J = np.zeros((K, len(problem.wand.pairs), 2, B, 3))
-    for e, (i, j) in enumerate(problem.wand.pairs):
-        along = gap[:, e] / length[:, e, None] / LENGTH_SIGMA_M
-        J[:, e, 0, i], J[:, e, 0, j] = along, -along
-    J = J.reshape(K, -1, 6 * B)
-    error = (problem.wand.lengths - length) / LENGTH_SIGMA_M
-    H = np.swapaxes(J, 1, 2) @ J + np.diag(np.repeat([STEP_SIGMA_M**-2, 0.0], 3 * B))
-    return _add_to_knots(np.zeros((K - 1, local + 1, local + 1)), H, np.einsum("kri,kr->ki", J, error))
+    by_knot = np.zeros((K, E, 2, B, 3))
+    for e, (i, j) in enumerate(wand.pairs):
+        along = gap[:, e] / length[:, e, None]
+        by_knot[:, e, 0, i], by_knot[:, e, 0, j] = along, -along
+    by_shape = np.broadcast_to(-wand.jacobians()[1][:n].T, (K, E, n))
+    J = np.concatenate([by_knot.reshape(K, E, 6 * B), by_shape], axis=2) / LENGTH_SIGMA_M
+    error = (wand.lengths - length) / LENGTH_SIGMA_M
+    H = J.mT @ J + np.diag(np.append(np.repeat([STEP_SIGMA_M**-2, 0.0], 3 * B), np.zeros(n)))
+    return _sum_knots(H, np.einsum("kri,kr->ki", J, error), 6 * B)
 
 
-def _add_to_knots(chain: Array, H: Array, g: Array) -> Array:
-    """Add Hessians (K, 6 B, 6 B) and gradients (K, 6 B) of the knots to a `chain`."""
-    half = g.shape[1]
-    for knots, intervals, at in ((slice(0, -1), slice(None), 0), (slice(-1, None), slice(-1, None), half)):
-        chain[intervals, at : at + half, at : at + half] += H[knots]
-        chain[intervals, at : at + half, -1] += g[knots]
+def _sum_knots(H: Array, g: Array, h: int) -> Array:
+    """Hessians (K, h + n, h + n) and gradients (K, h + n) by knot and shape, as `LinearSystem.chain`."""
+    n = len(g[0]) - h
+    chain, shape = np.zeros((len(g) - 1, 2 * h + n + 1, 2 * h + n + 1)), np.arange(2 * h, 2 * h + n)
+    for knots, intervals, at in ((slice(0, -1), slice(None), 0), (slice(-1, None), slice(-1, None), h)):
+        columns = np.append(np.arange(at, at + h), shape)
+        chain[intervals, columns[:, None], columns] += H[knots]
+        chain[intervals, columns, -1] += g[knots]
     return chain
 
 

@@ -16,14 +16,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-import msgspec
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.special import chdtrc, stdtrit
+from scipy.special import chdtrc, ndtr, stdtrit
 
 from calib.errors import CalibrationError, CameraFault
-from calib.rig.camera import LENS, lens_parameters, span_dimension
-from calib.rig.estimation import CHANCE, CLEAR, GROSS, MEDIAN_DEVIATION, coordinate_sigma
+from calib.rig.camera import LENS, lens_parameters
+from calib.rig.estimation import CHANCE, CLEAR, GROSS, coordinate_sigma
 from calib.rig.triangulation import intersect_images
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations
@@ -36,12 +34,10 @@ from camera_node.geometry.lens import Lens
 
 # Of the distance, by sizes: what tone curves and dot gain leave of them; 2 % in the first seconds of a camera.
 MAX_SIZE_ERROR = 0.04
-# Of the wand's length: an error of a distance between its markers that displaces cameras beyond what is claimed, and
-# one from which it is not known which distance is right.
+# Of the wand's length: an error of a distance between its markers that is worth a sentence, and one from which it is
+# not known which distance is right.
 MIN_SPACING_ERROR, MAX_SPACING_ERROR = 0.002, 0.03
-EXACT_M = 1e-6  # the least standard deviation of a distance: recordings without noise have none
-MEDIAN_EFFICIENCY = 0.37  # of a median deviation, against a standard deviation (Rousseeuw and Croux 1993)
-MIN_MEASURED = 8  # frame sets at which a distance is measured
+EXACT_M = 1e-6  # the least standard deviation of a wand's shape: recordings without noise have none
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
 CLEARLY = 0.25  # of this distance, that the rays of synchronous cameras pass each other at most, if exchanged rightly
@@ -107,18 +103,21 @@ class Spacing:
     Attributes:
         pairs: (P, 2) of markers.
         given: (P,) by the wand's file.
-        found, sigma: (P,) as the cameras measure them, and standard deviations; the largest is as in the file.
-        count: (P,) frame sets that they were measured in.
+        found: (P,) as the cameras measure them; the largest is as in the file.
+        chance: probability of differences as large from noise alone.
+        scale_sigma: standard deviation of the size of the wand, relative, that errors of its file as large give.
     """
 
     pairs: Index
     given: Array
     found: Array
-    sigma: Array
-    count: Index
+    chance: float
+    scale_sigma: float
 
     def sentence(self) -> str:
-        """The distance that is off by the largest share."""
+        """The distance that is off by the largest share; empty where noise explains it, or none matters."""
+        if self.chance > CHANCE or self.error < MIN_SPACING_ERROR:
+            return ""
         worst, largest = int(np.abs(np.log(self.found / self.given)).argmax()), int(self.given.argmax())
         (a, b), (c, d) = self.pairs[worst].tolist(), self.pairs[largest].tolist()
         return (
@@ -131,62 +130,35 @@ class Spacing:
         """The largest difference, as a share of the largest distance."""
         return float(np.abs(self.found - self.given).max() / self.given.max())
 
-    @property
-    def is_explained(self) -> bool:
-        """Whether noise explains the differences: Student's test, with as many degrees of freedom as a median deviation
-        of `count` has by its efficiency."""
-        limit = -stdtrit(MEDIAN_EFFICIENCY * (self.count - 1), CHANCE / (2 * len(self.count)))
-        return bool((np.abs(self.found - self.given) < limit * self.sigma).all())
 
-    def correct(self, wand: Body) -> Body:
-        """The wand with its markers at these distances, as near to their places in the file as these allow; markers in
-        a line or in a plane stay there, as the cameras may not show more."""
-        (first, second), count = self.pairs.T, len(wand.markers)
-        axes = np.linalg.svd(wand.points - wand.points.mean(axis=0))[2][: span_dimension(wand.points)]
+def measure_spacing(adjusted: Adjusted) -> Spacing | None:
+    """The distances between the wand's markers in its adjusted shape; None where it has one shape only.
 
-        def residuals(off: Array) -> Array:
-            points = wand.points + off.reshape(count, -1) @ axes
-            lengths = np.linalg.norm(points[first] - points[second], axis=1)
-            return np.concatenate(
-                [(lengths - self.found) / self.sigma, off / (MAX_SPACING_ERROR * self.given.max())]
-            )
-
-        off = least_squares(residuals, np.zeros(count * len(axes))).x.reshape(count, -1)
-        return msgspec.structs.replace(wand, markers=tuple(map(tuple, (wand.points + off @ axes).tolist())))
-
-
-def measure_spacing(wand: Body, adjusted: Adjusted, observations: WandObservations) -> Spacing | None:
-    """The distances between the markers that are farthest apart and all others; None where fewer than two are known."""
-    # A marker at a wrong place is at wrong distances from the markers that are farthest apart: their number counts.
-    basis = adjusted.problem.wand.basis.tolist()
-    pairs = np.array(
-        sorted({(min(a, b), max(a, b)) for a in basis for b in range(len(wand.markers)) if a != b})
+    The shape does not contain the size. Where the file is off by s in each coordinate of a marker, the n parameters of
+    the shape show s, and the size is off by s / |points|: Student's distribution with n degrees of freedom.
+    """
+    wand, shape = adjusted.problem.wand, adjusted.state.shape
+    if not (n := len(shape)):
+        return None
+    pairs = np.array(list(combinations(range(len(wand.points)), 2)))
+    given, found = _pair_distances(np.array([wand.points, wand.displaced(shape).points]), pairs)
+    covariance = adjusted.scale**2 * adjusted.inflation * adjusted.shape_covariance + EXACT_M**2 * np.eye(n)
+    variance = max(shape @ shape - np.trace(covariance), 0.0) / n
+    size = np.linalg.norm(wand.points - wand.points.mean(axis=0))
+    return Spacing(
+        pairs,
+        given,
+        found * given.max() / found[given.argmax()],
+        chance=float(chdtrc(n, shape @ np.linalg.solve(covariance, shape))),
+        scale_sigma=float(stdtrit(n, ndtr(1)) * np.sqrt(variance) / size),
     )
-    if len(pairs) < 2:
-        return None
-    given = _pair_distances(wand.points[None], pairs)[0]
-    # A wrong file makes all observations of a marker outliers.
-    every = np.ones(len(observations), bool)
-    measured = _pair_distances(triangulate_markers(adjusted, observations, every), pairs)
-    count = np.isfinite(measured).sum(axis=0)
-    known = count >= MIN_MEASURED
-    if known.sum() < 2:
-        return None
-    pairs, given, measured = pairs[known], given[known], measured[:, known]
-    found = np.nanmedian(measured, axis=0)
-    spread = np.nanmedian(np.abs(measured - found), axis=0) / MEDIAN_DEVIATION
-    sigma = np.maximum(spread * np.sqrt(np.pi / 2 / count[known]), EXACT_M)  # of a median
-    longest = given.argmax()
-    share = found / found[longest]
-    sigma = np.hypot(sigma, share * sigma[longest]) * given[longest] / found[longest]
-    return Spacing(pairs, given, share * given[longest], sigma, count[known])
 
 
-def sum_squares(adjusted: Adjusted, observations: WandObservations) -> float:
-    """The sum of all squared residuals in their assumed standard deviations, each as a gross error at most."""
-    residuals = adjusted.residuals
-    squares = np.einsum("ni,nij,nj->n", residuals, np.linalg.inv(observations.cov), residuals)
-    return float(np.fmin(squares, GROSS**2).sum())
+def check_spacing(adjusted: Adjusted) -> None:
+    """Raise CalibrationError where the wand differs so much that it is not known which of its distances is right."""
+    spacing = measure_spacing(adjusted)
+    if spacing is not None and spacing.error > MAX_SPACING_ERROR and (sentence := spacing.sentence()):
+        raise CalibrationError(f"{sentence}; measure the wand again")
 
 
 def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) -> None:
@@ -207,14 +179,14 @@ def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) 
     )
 
 
-def triangulate_markers(adjusted: Adjusted, observations: WandObservations, chosen: Mask) -> Array:
-    """(K, M, 3) positions of the wand's markers by chosen (n,) observations alone, world; NaN where fewer than two
-    cameras saw one, or their rays are parallel.
+def triangulate_markers(adjusted: Adjusted, observations: WandObservations) -> Array:
+    """(K, M, 3) positions of the wand's markers by the used observations alone, world; NaN where fewer than two cameras
+    saw one, or their rays are parallel.
 
     One Gauss-Newton step of every marker of a frame set from its adjusted position, without the wand's lengths.
     """
-    state, problem, rows = adjusted.state, adjusted.problem, np.flatnonzero(chosen)
-    markers = np.einsum("mb,kbx->kmx", problem.wand.weights, state.motion[:, 0])
+    state, problem, rows = adjusted.state, adjusted.problem, np.flatnonzero(adjusted.used)
+    markers = np.einsum("mb,kbx->kmx", problem.wand.displaced(state.shape).weights, state.motion[:, 0])
     camera, k, m = observations.camera[rows], observations.knot[rows], observations.label[rows]
     lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
     J = np.nan_to_num(point_jacobians(lenses, state.cameras, camera, markers[k, m])[1])
@@ -232,8 +204,8 @@ def triangulate_markers(adjusted: Adjusted, observations: WandObservations, chos
 
 def measure_lengths(adjusted: Adjusted, observations: WandObservations) -> Array:
     """(n,) errors of the wand's lengths as the cameras alone measure them, metres."""
-    wand = adjusted.problem.wand
-    markers = triangulate_markers(adjusted, observations, adjusted.used)
+    wand = adjusted.problem.wand.displaced(adjusted.state.shape)
+    markers = triangulate_markers(adjusted, observations)
     errors = _pair_distances(markers[:, wand.basis], wand.pairs) - wand.lengths
     return errors[np.isfinite(errors)]
 
@@ -375,13 +347,14 @@ def _interpolate_motion(adjusted: Adjusted, observations: WandObservations, of: 
     """(n, 3) positions of observed markers, world, between the nearest knots that two cameras or more determine: where
     all detections of a frame set are wrong, its own knot is."""
     problem, used = adjusted.problem, adjusted.used
+    wand = problem.wand.displaced(adjusted.state.shape)
     views = np.zeros((len(problem.knot_s), len(problem.lenses)), bool)
     views[observations.knot[used], observations.camera[used]] = True
     known = views.sum(axis=1) >= 2
     t_s = adjusted.state.true_times(of, problem.middle_s)
     positions = adjusted.state.motion[known, 0].reshape(int(known.sum()), -1)
     basis = np.column_stack([np.interp(t_s, problem.knot_s[known], column) for column in positions.T])
-    return np.einsum("nb,nbx->nx", problem.wand.weights[of.label], basis.reshape(len(t_s), -1, 3))
+    return np.einsum("nb,nbx->nx", wand.weights[of.label], basis.reshape(len(t_s), -1, 3))
 
 
 def _pixel_distances(lens: Lens, T: Array, points: Array, uv: Array) -> Array:

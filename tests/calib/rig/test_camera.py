@@ -26,7 +26,7 @@ def test_jacobians_agree_with_steps_of_the_state(lens: Lens):
     state = State.of(np.eye(4)[None], np.zeros(1), np.zeros((2, 2, 1, 3)))
 
     def see(step, shift):
-        moved = state.retract(step[None], np.zeros(12))
+        moved = state.retract(step[None], np.zeros(12), state.shape)
         T = moved.cameras[0]
         return moved.lens(0, lens).project((points + shift - T[:3, 3]) @ T[:3, :3])
 

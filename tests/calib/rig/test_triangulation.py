@@ -48,7 +48,7 @@ def test_the_jacobians_of_a_camera_are_those_of_the_adjustment():
     state = State.of(np.eye(4)[None], np.zeros(1), np.zeros((2, 2, 1, 3)))
 
     def project(step: Array) -> Array:
-        moved = state.retract(step[None], np.zeros(12))
+        moved = state.retract(step[None], np.zeros(12), state.shape)
         T = moved.cameras[0]
         return moved.lens(0, camera).project((points - T[:3, 3]) @ T[:3, :3])
 
