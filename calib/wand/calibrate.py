@@ -53,11 +53,11 @@ from calib.wand.quality.checks import (
     check_lenses,
     check_motion,
     check_sizes,
-    check_spacing,
     find_exchanges,
     triangulated_residuals,
 )
 from calib.wand.quality.contradictions import check_mirrored, check_residuals
+from calib.wand.quality.wand_shape import check_shape
 from calib.wand.recording_checks import check_cameras, check_inside, check_recording
 from calib.wand.scale import Distance
 from calib.wand.trajectory import acceleration_density
@@ -438,7 +438,7 @@ def adjust_rig(recording: WandRecording, rough: RoughRig) -> Solution:
     """
     solution = adjust_coarsely(recording, rough)
     coarse = solution.adjusted
-    check_spacing(coarse)
+    check_shape(coarse)
     check_lenses(recording.names, coarse)
     check_mirrored(recording.wand, coarse)
     try:

@@ -15,8 +15,9 @@ from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_cov
 from calib.wand.bundle_adjustment.problem import Adjusted, WandObservations, gauge_directions
 from calib.wand.bundle_adjustment.residuals import point_residuals
 from calib.wand.detections import WandRecording
-from calib.wand.quality.checks import Spacing, measure_lengths, measure_spacing
+from calib.wand.quality.checks import measure_lengths
 from calib.wand.quality.lenses import find_lens_changes
+from calib.wand.quality.wand_shape import WandShape, measure_shape
 from calib.wand.scale import Distance, DistanceComparison
 from calib.wand.wand_report import (
     BackgroundReport,
@@ -80,11 +81,12 @@ class Placement:
 def conclude(rig: Rig, solution: Solution, placement: Placement, jump: ClockJump | None) -> WandCalibration:
     """Build the result: the rig in an upright world, clocks relative to their median, and the report."""
     adjusted, observations = solution.adjusted, solution.observations
-    spacing = measure_spacing(adjusted)
+    shape = measure_shape(adjusted)
     if placement.scaled_by is not None:
         adjusted = add_scale_uncertainty(adjusted, placement.scaled_by.sigma_m / placement.scaled_by.metres)
-    elif spacing is not None:
-        adjusted = add_scale_uncertainty(adjusted, spacing.scale_sigma)
+    elif shape is not None:
+        size, sigma = shape.size
+        adjusted = add_scale_uncertainty(adjusted.scaled(size), sigma)
     covariance = camera_covariance(adjusted)
     offsets, drift, readout = (adjusted.state.clocks * CLOCK_UNITS).T
     variances = np.einsum("cpcp->cp", covariance.of((*OFFSET, *DRIFT, *READOUT)))
@@ -93,7 +95,7 @@ def conclude(rig: Rig, solution: Solution, placement: Placement, jump: ClockJump
     size = 6 * len(placement.recording.names)
     return WandCalibration(
         rig=_place(rig, adjusted, covariance, placement, offsets),
-        report=_build_report(replace(solution, adjusted=adjusted), covariance, placement, spacing),
+        report=_build_report(replace(solution, adjusted=adjusted), covariance, placement, shape),
         names=placement.recording.names,
         adjusted=adjusted,
         observations=observations,
@@ -192,7 +194,7 @@ def _place(
 
 
 def _build_report(
-    solution: Solution, covariance: CameraCovariance, placement: Placement, spacing: Spacing | None
+    solution: Solution, covariance: CameraCovariance, placement: Placement, shape: WandShape | None
 ) -> WandReport:
     adjusted, observations = solution.adjusted, solution.observations
     names, distance = placement.recording.names, placement.compared_with
@@ -214,7 +216,7 @@ def _build_report(
         scaled_by=placement.scaled_by,
         compared=compare_distance(distance, names, adjusted) if distance else None,
         timing=placement.timing,
-        wand=spacing.sentence() if spacing else "",
+        wand=shape.sentence() if shape else "",
         adjusted_lenses={
             name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
         },

@@ -89,6 +89,10 @@ class AffineWand:
             return self
         return self._at(self.points + np.tensordot(shape, self.shapes, 1), self.shapes, self.basis)
 
+    def scaled(self, factor: float) -> "AffineWand":
+        """The wand at another size."""
+        return self._at(factor * self.points, self.shapes, self.basis)
+
     def jacobians(self) -> tuple[Array, Array]:
         """Derivatives of the weights (n, M, B) and of the lengths (n, E) by the combination of `shapes`."""
         moved = self.shapes[:, self.basis]
@@ -186,6 +190,13 @@ class State:
         clocks, lenses = self.clocks + camera_step[:, 6:9], self.lenses + camera_step[:, 9:]
         motion = self.motion + motion_step.reshape(self.motion.shape)
         return State(cameras, clocks, lenses, motion, self.shape + shape_step, self.points)
+
+    def scaled(self, factor: float) -> "State":
+        """The state at another scale of the world."""
+        cameras = self.cameras.copy()
+        cameras[:, :3, 3] *= factor
+        lengths = {name: factor * getattr(self, name) for name in ("motion", "shape", "points")}
+        return replace(self, cameras=cameras, **lengths)
 
     def true_times(self, observations: MarkerImages, middle_s: float) -> Array:
         """(n,) true capture times: stamp + offset + drift (stamp - `middle_s`) + readout time x height in the image."""
@@ -310,10 +321,9 @@ class Problem:
         if self.fixed_distance is None:
             return state
         a, b, distance = self.fixed_distance
-        factor = distance / float(np.linalg.norm(state.cameras[a, :3, 3] - state.cameras[b, :3, 3]))
-        cameras = state.cameras.copy()
-        cameras[:, :3, 3] *= factor
-        return replace(state, cameras=cameras, motion=factor * state.motion, points=factor * state.points)
+        return state.scaled(
+            distance / float(np.linalg.norm(state.cameras[a, :3, 3] - state.cameras[b, :3, 3]))
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,6 +381,19 @@ class Adjusted:
     background_used: Mask
     converged: bool
     inflation: float = 1.0
+
+    def scaled(self, factor: float) -> "Adjusted":
+        """The adjustment with the wand, and so the world, at another size."""
+        problem, translations = self.problem, np.isin(self.problem.free, POSE[3:])
+        by = np.tile(np.where(translations, 1 / factor, 1.0), len(problem.estimated_cameras()))
+        return replace(
+            self,
+            problem=replace(problem, wand=problem.wand.scaled(factor), density=factor**2 * problem.density),
+            state=self.state.scaled(factor),
+            information=by[:, None] * self.information * by,
+            shape_covariance=factor**2 * self.shape_covariance,
+            scores=by * self.scores,
+        )
 
 
 def gauge_directions(state: State, free: tuple[int, ...]) -> Array:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.special import chdtrc, ndtr, stdtrit
+from scipy.special import chdtrc
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, lens_parameters
@@ -34,10 +34,6 @@ from camera_node.geometry.lens import Lens
 
 # Of the distance, by sizes: what tone curves and dot gain leave of them; 2 % in the first seconds of a camera.
 MAX_SIZE_ERROR = 0.04
-# Of the wand's length: an error of a distance between its markers that is worth a sentence, and one from which it is
-# not known which distance is right.
-MIN_SPACING_ERROR, MAX_SPACING_ERROR = 0.002, 0.03
-EXACT_M = 1e-6  # the least standard deviation of a wand's shape: recordings without noise have none
 MIN_MOTION = 0.02  # of an image's longer side, that the wand moves
 GATE = 0.01  # of an image's longer side: a detection this near to the expected place is of that camera
 CLEARLY = 0.25  # of this distance, that the rays of synchronous cameras pass each other at most, if exchanged rightly
@@ -94,71 +90,6 @@ def check_motion(detections: WandDetections, names: Sequence[str], lenses: Seque
             f"the wand hardly moved: by {moved[name]:.1f} px in the image of '{name}', and less in the others; wave it "
             "through the whole volume"
         )
-
-
-@dataclass(frozen=True, slots=True)
-class Spacing:
-    """Distances between the markers of a wand, metres.
-
-    Attributes:
-        pairs: (P, 2) of markers.
-        given: (P,) by the wand's file.
-        found: (P,) as the cameras measure them; the largest is as in the file.
-        chance: probability of differences as large from noise alone.
-        scale_sigma: standard deviation of the size of the wand, relative, that errors of its file as large give.
-    """
-
-    pairs: Index
-    given: Array
-    found: Array
-    chance: float
-    scale_sigma: float
-
-    def sentence(self) -> str:
-        """The distance that is off by the largest share; empty where noise explains it, or none matters."""
-        if self.chance > CHANCE or self.error < MIN_SPACING_ERROR:
-            return ""
-        worst, largest = int(np.abs(np.log(self.found / self.given)).argmax()), int(self.given.argmax())
-        (a, b), (c, d) = self.pairs[worst].tolist(), self.pairs[largest].tolist()
-        return (
-            f"the wand differs from its file: markers {a} and {b} are {self.given[worst]:.4f} m apart there, and "
-            f"{self.found[worst]:.4f} m as the cameras measure it, if {c} and {d} are {self.given[largest]:.4f} m apart"
-        )
-
-    @property
-    def error(self) -> float:
-        """The largest difference, as a share of the largest distance."""
-        return float(np.abs(self.found - self.given).max() / self.given.max())
-
-
-def measure_spacing(adjusted: Adjusted) -> Spacing | None:
-    """The distances between the wand's markers in its adjusted shape; None where it has one shape only.
-
-    The shape does not contain the size. Where the file is off by s in each coordinate of a marker, the n parameters of
-    the shape show s, and the size is off by s / |points|: Student's distribution with n degrees of freedom.
-    """
-    wand, shape = adjusted.problem.wand, adjusted.state.shape
-    if not (n := len(shape)):
-        return None
-    pairs = np.array(list(combinations(range(len(wand.points)), 2)))
-    given, found = _pair_distances(np.array([wand.points, wand.displaced(shape).points]), pairs)
-    covariance = adjusted.scale**2 * adjusted.inflation * adjusted.shape_covariance + EXACT_M**2 * np.eye(n)
-    variance = max(shape @ shape - np.trace(covariance), 0.0) / n
-    size = np.linalg.norm(wand.points - wand.points.mean(axis=0))
-    return Spacing(
-        pairs,
-        given,
-        found * given.max() / found[given.argmax()],
-        chance=float(chdtrc(n, shape @ np.linalg.solve(covariance, shape))),
-        scale_sigma=float(stdtrit(n, ndtr(1)) * np.sqrt(variance) / size),
-    )
-
-
-def check_spacing(adjusted: Adjusted) -> None:
-    """Raise CalibrationError where the wand differs so much that it is not known which of its distances is right."""
-    spacing = measure_spacing(adjusted)
-    if spacing is not None and spacing.error > MAX_SPACING_ERROR and (sentence := spacing.sentence()):
-        raise CalibrationError(f"{sentence}; measure the wand again")
 
 
 def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) -> None:

@@ -14,10 +14,10 @@ from tests.calib.synthetic import record, ring
 
 
 def test_the_quality_of_a_calibration_with_little_noise():
-    """With 0.1 px of noise and 8 s, only the coverage and the lenses, of unknown standard deviation, prevent an A:
+    """With 0.1 px of noise and 10 s, only the coverage and the lenses, of unknown standard deviation, prevent an A:
     without the lenses, every pose has one. Points are known to millimetres."""
     arena = ring(4)
-    quality = assess(calibrate(arena.intrinsics, arena.wand, record(arena, 8.0, sigma_px=0.1)), arena.wand)
+    quality = assess(calibrate(arena.intrinsics, arena.wand, record(arena, 10.0, sigma_px=0.1)), arena.wand)
     names = {camera.name for camera in quality.cameras}
     assert names == set(arena.truth.cameras)
     for camera in quality.cameras:
