@@ -374,10 +374,8 @@ def _solve_globals(system: LinearSystem, information: Array, gradient: Array) ->
     free, count = list(problem.free), len(problem.estimated_cameras())
     rows, (by_priors, prior_gradient) = problem.global_rows(), system.priors
     H, g = information + by_priors[np.ix_(rows, rows)], gradient + prior_gradient[rows]
-    parts = np.split(
-        np.arange(len(rows)), len(free) * np.arange(1, count + 1)
-    )  # of each camera, and of the shape
-    parts = parts if problem.shapes else parts[:-1]
+    # Those of each camera, then those of the shape.
+    parts = np.split(np.arange(len(rows)), len(free) * np.arange(1, count + (problem.shapes > 0)))
     zeros = [(np.zeros((len(part), len(part))), np.zeros(len(part))) for part in parts]
     for k, part in enumerate(parts):
         ordering.push_back(k)
