@@ -70,7 +70,13 @@ def arguments_of(unit: str, folder: Path) -> list[str]:
 
 
 @needs_systemd
-@pytest.mark.parametrize("unit", ["roundel-fusion", "roundel-web", "roundel-camera@"])
+@pytest.mark.parametrize(
+    "unit",
+    [
+        "roundel-fusion",
+        *(pytest.param(unit, marks=pytest.mark.ci) for unit in ("roundel-web", "roundel-camera@")),
+    ],
+)
 def test_a_service_works_under_its_filter_and_reports(unit: str, tmp_path: Path):
     """Ready, then its state and progress, until SIGTERM ends it with exit code 0."""
     sandbox = [sys.executable, str(ROOT / "tests" / "seccomp.py"), str(UNITS / f"{unit}.service")]

@@ -148,6 +148,7 @@ def test_renewal_replaces_certificates_while_old_ones_are_valid(tmp_path: Path):
         require_rights(*map(lab.session, (*names, "old-camera.north", "old-viewer")))
 
 
+@pytest.mark.ci
 def test_a_revoked_certificate_has_no_rights_and_its_successor_has(tmp_path: Path):
     """While the server runs: the thief of a camera's key can connect, and neither publish, nor ask, nor receive.
 

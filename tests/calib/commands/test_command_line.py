@@ -60,6 +60,7 @@ def test_wand_then_world_from_a_csv(tmp_path: Path, arena: Arena):
         assert camera.matrix()[:3, 3] == pytest.approx(truth[:3, 3], abs=5e-3)
 
 
+@pytest.mark.ci
 def test_observations_of_unknown_lenses_need_the_image_size_only(tmp_path: Path, arena: Arena):
     """Without a rig file: a guess of 90 degrees for lenses of 75; focal lengths come within 1 %."""
     options = [
@@ -153,6 +154,7 @@ def test_check_judges_a_rig_and_writes_only_to_the_given_files(tmp_path: Path, a
     assert all(cv2.imread(str(tmp_path / "maps" / name)) is not None for name in names)
 
 
+@pytest.mark.ci
 def test_only_calibrates_one_camera_and_leaves_the_others(tmp_path: Path, arena: Arena):
     """From the same recording; the other cameras are unchanged, and an unknown camera is named."""
     write_observations(
@@ -244,6 +246,7 @@ def test_a_folder_of_one_camera_or_of_an_unknown_one_is_refused(tmp_path: Path, 
     assert (done.returncode, "'north'" in done.stderr) == (2, True)
 
 
+@pytest.mark.ci
 def test_frames_of_an_arena_from_another_renderer(tmp_path: Path, shared_data: Callable[[str], Path]):
     """Four free-running cameras: the error of every camera is below 3 mm and 0.1 degrees."""
     recording = shared_data("arena_small")

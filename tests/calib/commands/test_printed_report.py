@@ -14,6 +14,7 @@ from calib.wand.quality.lenses import describe_lens_changes, find_lens_changes
 from tests.calib.recordings import WandScenario, record
 
 
+@pytest.mark.ci
 def test_a_wrong_lens_is_reported_with_its_correction(capsys: pytest.CaptureFixture[str]):
     """The focal length of one camera is 1 % off in the file. The reported correction is right to four of its standard
     deviations and equals that of the rig; no other lens is reported as changed."""

@@ -194,6 +194,7 @@ def test_the_advice_is_about_the_weakest_camera(trial: Trial | None, words: str)
     assert words in summarize(collected, 5.0, trial, False).advice
 
 
+@pytest.mark.ci
 def test_a_recording_is_saved_and_can_be_calibrated_again_by_the_printed_command(
     tmp_path: Path, endpoint: str, capsys: pytest.CaptureFixture[str]
 ):
@@ -220,7 +221,6 @@ def test_a_recording_is_saved_and_can_be_calibrated_again_by_the_printed_command
     assert_near(load_rig(out), arena.truth, 2e-4, 2e-4)  # no noise
 
 
-@pytest.mark.ci
 def test_a_trial_whose_process_ends_is_reported_and_the_next_one_succeeds():
     """Also if the process ends while it waits for the next trial."""
     arena, now_s = ring(3), count(10.0, 10.0)

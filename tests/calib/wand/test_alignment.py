@@ -149,6 +149,7 @@ def test_motions_of_different_wands_are_not_aligned():
     assert not align_clocks(first.intrinsics, WAND, mixed).maps
 
 
+@pytest.mark.ci
 def test_clocks_that_a_server_keeps_are_not_changed():
     recorded = light()
     bounded = [msgspec.structs.replace(m, clock_error_us=500.0) for m in recorded.messages]

@@ -110,6 +110,7 @@ def test_a_given_readout_time_is_used():
     assert squared < chi2.ppf(0.999, degrees)
 
 
+@pytest.mark.ci
 def test_a_global_shutter_has_no_readout_time():
     recorded = waved(0.0, seconds=5)
     result = calibrate(recorded.intrinsics, STICK, recorded.messages)

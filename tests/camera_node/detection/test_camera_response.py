@@ -156,13 +156,16 @@ def test_roundels_are_found_and_claimed_behind_a_curve_with_a_shoulder(band):
     assert measured.size < 3
 
 
-@pytest.mark.parametrize(("from_rim", "goal"), [(False, MILD_SHARE), (True, 0.9)])
+@pytest.mark.parametrize(
+    ("from_rim", "goal"), [pytest.param(False, MILD_SHARE, marks=pytest.mark.ci), (True, 0.9)]
+)
 def test_covered_roundels_are_found_behind_a_mild_camera(mild: Detector, from_rim, goal):
     """A fifth of the diameter is covered. Four binomial standard deviations of the goal are subtracted."""
     share = share_found(mild, MILD, partial(covered, 0.2, from_rim), CARDS // 30)
     assert share > goal - 4 * np.sqrt(goal * (1 - goal) / CARDS)
 
 
+@pytest.mark.ci
 def test_a_camera_that_denoises_and_sharpens_is_learned():
     """Flat areas hide what processing does at edges. Before it was learned, no covered roundel was found.
 
@@ -190,7 +193,7 @@ def test_noise_of_a_dim_room_hides_no_roundels():
     assert share_found(known(DIM), DIM, dim, 2) > 0.9
 
 
-@pytest.mark.parametrize("paper", [308.0, 410.0])
+@pytest.mark.parametrize("paper", [pytest.param(308.0, marks=pytest.mark.ci), 410.0])
 def test_clipped_paper_is_found(paper):
     clean = Sensor(noise=3.0)
     assert share_found(known(clean), clean, partial(over_exposed, paper), 3) > 0.97

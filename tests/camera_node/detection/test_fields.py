@@ -28,7 +28,11 @@ def test_a_bend_is_removed_from_the_outline_and_its_unknown_part_is_claimed(diam
 
 
 @pytest.mark.parametrize(
-    ("bend", "diameter", "share"), [(0.05, 160, 0.9), pytest.param(0.03, 300, 0.8, marks=pytest.mark.slow)]
+    ("bend", "diameter", "share"),
+    [
+        pytest.param(0.05, 160, 0.9, marks=pytest.mark.ci),
+        pytest.param(0.03, 300, 0.8, marks=pytest.mark.slow),
+    ],
 )
 def test_strongly_bent_paper_is_found_when_large(bend, diameter, share):
     """Edges are displaced in proportion to the size: at full size alone, 5 of 8 of 300 px are found."""
@@ -64,7 +68,7 @@ def test_uneven_light_is_within_the_claims(what):
     [
         (First(NOISE, soft_shadow).show, 0.9, 2),
         (First(NOISE, partial(soft_shadow, penumbra=0.02)).show, 0.65, 2),
-        (Second(light="shadow").show, 0.85, 1),
+        pytest.param(Second(light="shadow").show, 0.85, 1, marks=pytest.mark.ci),
     ],
     ids=["soft", "hard", "second generator"],
 )

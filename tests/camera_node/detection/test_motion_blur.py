@@ -29,6 +29,7 @@ def exposed(length: float, turn: float, tilt: float, ground: float) -> np.ndarra
     return np.mean([render([disc], SIZE, ground=ground, blur=0.7) for disc in discs], axis=0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("length", [pytest.param(12.0, marks=pytest.mark.slow), 24.0])
 def test_moving_roundels_are_tracked_with_a_consistent_covariance(length: float):
     """They are found in six directions; squared Mahalanobis errors have mean 2, and four sigmas of the mean are 0.82.

@@ -55,6 +55,7 @@ def test_the_claimed_errors_are_honest(px: float, tilts: tuple[float, float]):
         )
 
 
+@pytest.mark.ci
 def test_the_probabilities_of_the_normals_are_calibrated():
     """At 14 px and up to 17 degrees the normal is uncertain: the mean probability of the likelier one is 85 %.
 

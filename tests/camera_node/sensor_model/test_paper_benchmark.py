@@ -121,6 +121,7 @@ def test_the_page_has_every_row_of_the_papers_tables():
         assert text.count(f"| {name} |") >= 3
 
 
+@pytest.mark.ci
 def test_the_plot_is_drawn(tmp_path: Path):
     pytest.importorskip("matplotlib")
     result = comparison.Result(0.9, 0.01, 0.1, 1.0, 0.0)

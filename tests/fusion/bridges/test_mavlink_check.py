@@ -63,6 +63,7 @@ def test_the_advice_about_the_heading_cures_it(angle: float):
     assert all(is_good for is_good, _ in checked(better, own).lines())
 
 
+@pytest.mark.ci
 def test_a_nose_elsewhere_a_long_delay_and_an_upward_z_are_named():
     here = FrdFrames((0.0, 0.0, 0.0), 0.0, 0.0)
     nose = [text for good, text in checked(here, FrdFrames((0.0, 0.0, 0.0), 0.0, 90.0)).lines() if not good]

@@ -15,7 +15,11 @@ FIRST, CALLBACK, AGE = programs("clients.md")
 
 
 @pytest.mark.parametrize(
-    ("program", "expected"), [(FIRST, "tracked"), (CALLBACK, "3 robots at"), (AGE, " s old")]
+    ("program", "expected"),
+    [
+        (FIRST, "tracked"),
+        *(pytest.param(*case, marks=pytest.mark.ci) for case in ((CALLBACK, "3 robots at"), (AGE, " s old"))),
+    ],
 )
 def test_a_program_prints_poses(program: str, expected: str):
     endpoint = f"tcp/127.0.0.1:{free_port()}"

@@ -184,6 +184,7 @@ def test_markers_that_make_no_robot_are_refused():
     assert len(find_stationary_markers([]).position) == 0
 
 
+@pytest.mark.ci
 def test_a_diameter_that_differs_from_the_discs_is_refused():
     """The server would never find such a robot: it looks for discs of the declared size. Discs of any size are seen."""
     for diameter_m in (0.06, 0.12, 0.3):

@@ -140,6 +140,7 @@ def test_a_result_replaces_no_folder(tmp_path: Path, command: str, out: str):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.ci
 def test_rerun_reads_its_recording(recording: Path, tmp_path: Path):
     """By Rerun's own reader: each pose that is not lost at its time, and the cameras."""
     chunks = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed: pip install '.[rerun]'")

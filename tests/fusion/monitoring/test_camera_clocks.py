@@ -64,6 +64,7 @@ def test_a_recording_without_arrival_times_shows_the_same(step_ms: float):
     assert outcome.in_use_since_s("cam1") < FAULT_S + RECOVERED_S
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("first_ms", "second_ms", "cameras"), [(25, -50, 4), pytest.param(25, 25, 5, marks=pytest.mark.ci)]
 )

@@ -128,6 +128,7 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
     assert indexed(tmp_path / "a.mcap") == []
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.ci), signal.SIGINT])
 def test_a_signal_closes_the_recording(tmp_path, number):
     path = tmp_path / "live.mcap"

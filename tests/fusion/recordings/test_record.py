@@ -137,6 +137,7 @@ def test_a_live_arena_is_recorded_with_its_rig_and_robots(tmp_path, capsys):
     assert f"on {KEYS.detections('cam0')}" in capsys.readouterr().out
 
 
+@pytest.mark.ci
 def test_a_public_recording_has_pictures_and_versions(tmp_path):
     """Of the first camera, as it sends them; a part of the recording keeps them, and the benchmark reads it."""
     path, part, jpeg = tmp_path / "public.mcap", tmp_path / "part.mcap", b"\xff\xd8 as the camera sends it"
@@ -256,6 +257,7 @@ def test_smoothing_preserves_frame_sets_and_states():
     assert [[p.state for p in f.poses] for f in plain] == [[p.state for p in f.poses] for f in better]
 
 
+@pytest.mark.ci
 def test_a_long_recording_is_smoothed_in_parts_as_if_it_were_whole():
     """What frame sets later than the lag change is below a thousandth of a standard deviation."""
     arena = Arena(MOVING.robots, MOVING.motions, sigma_px=0.1, hidden=lambda robot, marker, t: 0.9 < t < 1.1)

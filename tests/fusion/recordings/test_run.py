@@ -76,6 +76,7 @@ def test_invalid_input_is_reported_in_one_line(recording, fault, said):
     assert len(error.strip().splitlines()) == 1
 
 
+@pytest.mark.ci
 def test_a_recording_of_another_renderer(shared_data, tmp_path):
     """Three robots and four free-running cameras with their true poses: at most 3 mm RMS, the goal for an arena.
 

@@ -79,7 +79,12 @@ def around(t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("off_m", "reported"), [pytest.param(0.02, True, marks=pytest.mark.ci), (0.005, True), (0.0, False)]
+    ("off_m", "reported"),
+    [
+        pytest.param(0.02, True, marks=pytest.mark.ci),
+        (0.005, True),
+        pytest.param(0.0, False, marks=pytest.mark.ci),
+    ],
 )
 def test_a_misplaced_marker_is_found_and_no_camera_is_blamed(off_m, reported, caplog):
     """The only robot in view of four cameras: 5 mm are 0.8 px, of which a fit of three markers leaves half. Its markers
@@ -115,6 +120,7 @@ def test_a_correct_camera_is_not_excluded(run_arena):
     assert follow(Tracker(arena.cameras, ROBOTS), frames)[0] == []
 
 
+@pytest.mark.ci
 def test_of_four_cameras_one_of_which_is_silent_the_moved_one_is_found():
     """Of three cameras that see robots, one that turned looks like the two others that turned together."""
     before, after = moved(2.0, 0.0)
@@ -184,6 +190,7 @@ def test_a_robot_that_only_one_camera_sees_does_not_show_that_this_one_moved():
     assert displaced == []
 
 
+@pytest.mark.ci
 def test_two_of_three_cameras_that_are_moved_one_after_the_other_stay_excluded():
     """By 3 degrees, each shows most markers elsewhere. One camera does not show their new poses, and a robot that is
     where it was for this one does not bring them back."""

@@ -128,6 +128,7 @@ def test_a_wand_calibration_in_a_fresh_process_is_in_force_on_the_server(tmp_pat
     assert_near(load_rig(file), arena.truth, 0.01, 0.005)
 
 
+@pytest.mark.ci
 def test_a_rig_that_the_server_can_t_save_is_refused(tmp_path: Path):
     """The command exits with 2 and the reason; the old rig stays in force."""
     settings = msgspec.structs.replace(config(tmp_path), saved_rig=str(tmp_path / "missing" / "rig.yaml"))
@@ -140,6 +141,7 @@ def test_a_rig_that_the_server_can_t_save_is_refused(tmp_path: Path):
         assert rig_of(endpoint).cameras == ARENA.cameras
 
 
+@pytest.mark.ci
 @pytest.mark.computed
 def test_without_a_server_commands_exit_with_2_and_one_line(tmp_path: Path):
     """All at once, because each waits for a server until its time is over."""

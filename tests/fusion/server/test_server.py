@@ -128,7 +128,9 @@ def send_in_real_time(server: Server, n_frames: int) -> None:
         pause.wait(1 / 30)
 
 
-@pytest.mark.parametrize(("max_lag_ns", "drops"), [(60 * 10**9, False), (0, True)])
+@pytest.mark.parametrize(
+    ("max_lag_ns", "drops"), [pytest.param(60 * 10**9, False, marks=pytest.mark.ci), (0, True)]
+)
 def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, monkeypatch, max_lag_ns, drops):
     """Frames arrive on time while the server is busy with something else."""
     monkeypatch.setattr("fusion.server.server.MAX_LAG_NS", max_lag_ns)

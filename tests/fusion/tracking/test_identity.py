@@ -174,7 +174,9 @@ def test_cold_starts_with_missing_frames_acquire_no_wrong_robot():
     assert acquired > 0.5 * 60 * load.robots
 
 
-@pytest.mark.parametrize("limit", ["MAX_COMPARED", "MAX_BODIES", "MAX_PAIRS"])
+@pytest.mark.parametrize(
+    "limit", ["MAX_COMPARED", pytest.param("MAX_BODIES", marks=pytest.mark.ci), "MAX_PAIRS"]
+)
 def test_limits_delay_the_acquisition_and_do_not_prevent_it(monkeypatch: pytest.MonkeyPatch, limit: str):
     """Each limit is a tenth of what the twelve robots need, or half of what they need among false detections."""
     module, value = {
@@ -252,6 +254,7 @@ def test_one_camera_tracks_a_constellation_but_not_a_single_marker(robot):
     assert tracked.all() if robot == "a" else not tracked[-20:].any()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "speed_m_s", [*(pytest.param(speed, marks=pytest.mark.ci) for speed in (0.0, 1.0)), 2.0]
 )

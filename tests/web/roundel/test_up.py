@@ -99,6 +99,7 @@ def test_a_camera_with_a_wrong_name_is_not_started_again(start, tmp_path: Path):
     assert up.stop(signal.SIGTERM) == 0
 
 
+@pytest.mark.ci
 def test_a_server_that_can_not_start_ends_the_command(start, tmp_path: Path):
     """Exit code and error are the server's: a broken file needs a user."""
     (tmp_path / "lab").mkdir()

@@ -74,6 +74,7 @@ def test_halves_agree_within_their_covariance(correlated: bool, expected: float,
         assert chi2 == pytest.approx(degrees, abs=4 * np.sqrt(2 * degrees))
 
 
+@pytest.mark.ci
 def test_the_path_of_a_light_does_not_contradict_lenses():
     """A light before free-running cameras for 30 s: files declare the lenses exact, and that is used; poses are right
     within the 99.9 % quantile of chi-square. With a motion prior that acts on the cameras too, lenses were adjusted by

@@ -82,6 +82,7 @@ def test_exact_lenses_lose_little(seed: int):
     assert squared < (1 + 0.3**2) * least
 
 
+@pytest.mark.ci
 def test_the_report_names_the_lens_that_limits_the_rig():
     """Four cameras, twelve seconds, focal lengths 2 % off: positions are known to centimetres, and the report names the
     lens."""

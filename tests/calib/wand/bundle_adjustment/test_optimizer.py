@@ -129,6 +129,7 @@ def test_the_initial_clock_shifts_of_pairs_are_right(recorded: SimulatedRecordin
         assert pair.shift_s * 1e3 == pytest.approx(expected, abs=6)
 
 
+@pytest.mark.ci
 def test_missing_time_in_all_cameras_rejects_no_observation():
     """The stamps of all cameras skip 0.3 s: the wand's motion jumps, and observations that agree are used."""
     scenario = WandScenario(

@@ -63,6 +63,7 @@ def test_the_reason_of_a_camera_that_is_left_out_names_its_clock(seed: int):
     assert len(result.names) == 3
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("rough", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("drift_ppm", [pytest.param(50.0, marks=pytest.mark.slow), 800.0])
 def test_ordinary_clocks_do_not_jump(drift_ppm: float, rough: bool):

@@ -96,6 +96,7 @@ def test_a_robot_that_moves_about_the_border_stays_with_its_owner():
     assert changes(after_start(stream, arena)) == 0
 
 
+@pytest.mark.ci
 def test_the_neighbour_of_a_killed_server_takes_its_robots():
     """Both robots are in the east: one near the border, which the west tracks along, one at the far end, which no
     camera of the west sees. The first has no gap above two frame sets, the second is tracked within a second."""
