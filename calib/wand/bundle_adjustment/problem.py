@@ -233,9 +233,9 @@ class Problem:
         readout_s: (C,) given readout times, which the stamps of observations contain.
         free: indices of the camera parameters that are estimated (`calib.rig.camera`).
         fixed_distance: two cameras and their distance, where no wand length fixes the scale.
-        estimated: cameras that are estimated, the others are fixed; None for all. Without any, the wand's shape is
-            fixed, too.
+        estimated: cameras that are estimated, the others are fixed; None for all.
         covariance_lens_sigma: (C, 9) prior standard deviations for the covariance; `lens_sigma` if None.
+        estimates_shape: whether the wand's shape is estimated.
         drift_sigma: prior standard deviation of the clocks' drift, s/s.
         background: images of the background points.
     """
@@ -252,6 +252,7 @@ class Problem:
     fixed_distance: tuple[int, int, float] | None = None
     estimated: tuple[int, ...] | None = None
     covariance_lens_sigma: Array | None = None
+    estimates_shape: bool = True
     drift_sigma: float = SLEWED_DRIFT
     background: BackgroundPoints = field(default_factory=BackgroundPoints.none)
 
@@ -270,8 +271,8 @@ class Problem:
 
     @property
     def shapes(self) -> int:
-        """The number of estimated parameters of the wand's shape."""
-        return 0 if self.estimated == () else len(self.wand.shapes)
+        """The number of estimated parameters of the wand's shape; none without an estimated camera."""
+        return len(self.wand.shapes) if self.estimates_shape and self.estimated != () else 0
 
     def shape_sigma(self) -> float:
         """Prior standard deviation of the wand's shape, metres."""
@@ -363,7 +364,7 @@ class Adjusted:
         scale: ratio of the residuals to their assumed standard deviations, the square root of the variance factor.
         information: (S d, S d) of the S estimated cameras' free parameters at the assumed noise, with priors. Its null
             space is the gauge: the choice of the world, and of the time that clocks are relative to.
-        shape_covariance: (n, n) of the wand's shape, at the assumed noise.
+        shape_covariance: (n, n) of the wand's shape, at the assumed noise; (0, 0) where it is fixed.
         scores: (L + J, S d) gradients by interval between knots, then by background point, without priors.
         background_used: images of background points that were not rejected.
         converged: whether the motion could be profiled out: it can't where the cameras contradict each other.

@@ -65,9 +65,9 @@ class WandShape:
 
 
 def measure_shape(adjusted: Adjusted) -> WandShape | None:
-    """The adjusted shape of the wand; None where it has one shape only."""
+    """The adjusted shape of the wand; None where it has one shape only, or that of its file."""
     wand, shape = adjusted.problem.wand, adjusted.state.shape
-    if not (n := len(shape)):
+    if not (n := len(adjusted.shape_covariance)):
         return None
     covariance = adjusted.scale**2 * adjusted.inflation * adjusted.shape_covariance + EXACT_M**2 * np.eye(n)
     pairs = np.array(list(combinations(range(len(wand.points)), 2)))
