@@ -12,7 +12,12 @@ from calib.rig.camera_errors import ERRORS, as_pose_errors, with_errors
 from calib.rig.rig import Rig
 from calib.wand.alignment import Alignment, ClockMap
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance, parameter_sigma
-from calib.wand.bundle_adjustment.problem import Adjusted, WandObservations, gauge_directions
+from calib.wand.bundle_adjustment.problem import (
+    Adjusted,
+    WandObservations,
+    gauge_directions,
+    scale_direction,
+)
 from calib.wand.bundle_adjustment.residuals import point_residuals
 from calib.wand.detections import WandRecording
 from calib.wand.quality.checks import measure_lengths
@@ -217,6 +222,7 @@ def _build_report(
         compared=compare_distance(distance, names, adjusted) if distance else None,
         timing=placement.timing,
         wand=shape.sentence() if shape else "",
+        size_sigma=shape.size[1] if shape else 0.0,
         adjusted_lenses={
             name: change.as_dict() for name, change in find_lens_changes(names, adjusted).items()
         },
@@ -301,12 +307,8 @@ def add_scale_uncertainty(adjusted: Adjusted, sigma: float) -> Adjusted:
     relative = sigma / (adjusted.scale * adjusted.inflation**0.5)
     if relative == 0:
         return adjusted
-    free, cameras = adjusted.problem.free, adjusted.state.cameras
-    by_scale = np.zeros((len(cameras), len(free)))
-    translations = [free.index(p) for p in POSE[3:]]
-    by_scale[:, translations] = np.einsum("cji,cj->ci", cameras[:, :3, :3], cameras[:, :3, 3])
-    gauge = np.linalg.qr(gauge_directions(adjusted.state, free))[0]
-    g = by_scale.ravel() - gauge @ (gauge.T @ by_scale.ravel())
+    gauge = np.linalg.qr(gauge_directions(adjusted.state, adjusted.problem.free))[0]
+    g = scale_direction(adjusted.problem, adjusted.state)
     weighted = adjusted.information @ g
     weighted -= gauge @ (gauge.T @ weighted)
     lost = np.outer(weighted, weighted) / (relative**-2 + g @ weighted)

@@ -162,6 +162,7 @@ class WandReport:
         compared: a measured distance compared with the wand.
         timing: whether the cameras are taken as synchronous, and why.
         wand: how the wand, as the cameras measure it, differs from its file; empty where it does not.
+        size_sigma: standard deviation of the wand's size, relative, from errors of its file.
         adjusted_lenses: the change of each lens by the adjustment, as `rig.yaml` has it.
         exchanges: cameras under whose names there are points of others; these were left out.
         background: the points beside the wand, if any are given.
@@ -181,6 +182,7 @@ class WandReport:
     compared: DistanceComparison | None
     timing: str
     wand: str
+    size_sigma: float
     adjusted_lenses: dict[str, Any]
     exchanges: list[Exchange]
     background: BackgroundReport | None = None

@@ -408,6 +408,16 @@ def gauge_directions(state: State, free: tuple[int, ...]) -> Array:
     return columns[:, free][:, :, present].reshape(-1, len(present))
 
 
+def scale_direction(problem: Problem, state: State) -> Array:
+    """(C d,) change of the free camera parameters by the relative size of the world, without its component along the
+    gauge."""
+    by_scale, cameras = np.zeros((len(state.cameras), PER_CAMERA)), state.cameras
+    by_scale[:, POSE[3:]] = np.einsum("cji,cj->ci", cameras[:, :3, :3], cameras[:, :3, 3])
+    change = by_scale[:, problem.free].ravel()
+    gauge = np.linalg.qr(gauge_directions(state, problem.free))[0]
+    return np.asarray(change - gauge @ (gauge.T @ change), float)
+
+
 def invert_information(problem: Problem, state: State, information: Array) -> Array:
     """(S d, S d) pseudo-inverse of the information on the estimated cameras, without the gauge."""
     if problem.estimated is not None:

@@ -16,6 +16,7 @@ from calib.rig.coverage import Coverage, cell_centres, enumerate_words
 from calib.rig.precision_map import SIGMA_PX, FloorGrid, PrecisionMap, map_precision
 from calib.rig.triangulation import JointCovariance, camera_jacobians
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance
+from calib.wand.bundle_adjustment.problem import scale_direction
 from calib.wand.quality.lenses import describe_open_lenses, find_lens_changes, find_open_lenses
 from calib.wand.wand_report import NOT_RECORDED, Validation, WandCalibration
 from camera_node.foundation.arrays import Array, Mask
@@ -116,6 +117,7 @@ class RigQuality:
         held_out: residuals of held-out detections; None where they could not be measured.
         open_lenses: 95 % interval of each focal length that the recording does not determine, pixels, by camera.
         wand: how the wand differs from its file, with what to do; empty where it does not.
+        size_sigma: standard deviation of the size of the wand, and so of the rig, relative.
     """
 
     cameras: list[CameraQuality]
@@ -125,12 +127,13 @@ class RigQuality:
     held_out: Validation | None = None
     open_lenses: dict[str, tuple[float, float]] = field(default_factory=dict)
     wand: str = ""
+    size_sigma: float = 0.0
 
     @property
     def grade(self) -> str:
-        """A to D: by held-out detections, at most one grade worse for the worst camera or the wand's length; D where a
-        camera is not placed."""
-        grades = [camera.grade for camera in self.cameras]
+        """A to D: by held-out detections, at most one grade worse for the worst camera or the wand's length or size; D
+        where a camera is not placed."""
+        grades = [camera.grade for camera in self.cameras] + [grade("length", self.size_sigma)]
         worst = max(grades + ([grade("length", self.length_error)] if self.length_error is not None else []))
         if self.unplaced:
             return "D"
@@ -154,6 +157,9 @@ class RigQuality:
         start = f"grade {self.grade}: {self._measured()}"
         if self.length_error is not None and grade("length", self.length_error) > max("A", worst.grade):
             return f"{start}the wand's length is {self.length_error:.2%} off; {ADVICE['length']}"
+        if grade("length", self.size_sigma) > max("A", worst.grade):
+            advice = "" if self.wand else "; measure it again"
+            return f"{start}the wand's size is known to {self.size_sigma:.1%} only{advice}"
         if worst.grade == "A":
             return f"{start}all cameras meet the limits"
         cause = _describe(worst.worst, worst.figures[worst.worst])
@@ -240,7 +246,9 @@ def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQua
     """
     positions = wand_positions(result)
     covariance = camera_covariance(result.adjusted)
-    cameras = [_assess_camera(result, k, positions, covariance) for k in range(len(result.names))]
+    by_size = result.report.size_sigma * scale_direction(result.adjusted.problem, result.adjusted.state)
+    by_size = by_size.reshape(len(result.names), -1)
+    cameras = [_assess_camera(result, k, positions, covariance, by_size[k]) for k in range(len(result.names))]
     length_mm, extent = result.report.length_mean_mm, np.linalg.norm(np.ptp(wand.points, axis=0))
     error = None if length_mm is None or extent == 0 else abs(length_mm) / 1e3 / float(extent)
     unplaced = {name: why for name, why in sorted(result.report.unplaced.items()) if why != NOT_RECORDED}
@@ -249,7 +257,16 @@ def assess(result: WandCalibration, wand: Body, height_m: float = 0.1) -> RigQua
     differs = result.report.wand and (
         f"{result.report.wand}; this was used: measure both again, and correct the wand file"
     )
-    return RigQuality(cameras, unplaced, error, expected, result.report.held_out, open_lenses, differs)
+    return RigQuality(
+        cameras,
+        unplaced,
+        error,
+        expected,
+        result.report.held_out,
+        open_lenses,
+        differs,
+        result.report.size_sigma,
+    )
 
 
 def wand_positions(result: WandCalibration) -> Array:
@@ -270,8 +287,10 @@ def _predict(
 
 
 def _assess_camera(
-    result: WandCalibration, k: int, positions: Array, covariance: CameraCovariance
+    result: WandCalibration, k: int, positions: Array, covariance: CameraCovariance, by_size: Array
 ) -> CameraQuality:
+    """Grade camera k, whose free parameters change by `by_size` (d,) with the standard deviation of the wand's size:
+    no longer recording would make that smaller."""
     row, joint, free = result.report.cameras[k], covariance.joint, covariance.free
     camera = result.rig.cameras[row.name]
     uv = result.observations.uv[(result.observations.camera == k) & result.adjusted.used]
@@ -285,19 +304,20 @@ def _assess_camera(
     figures = {
         "residual_px": row.residual_px,
         "rejected": row.outliers / max(row.outliers + row.observations, 1),
-        "pose_px": _rms_px(J, joint[k, :, k]),
+        "pose_px": _rms_px(J, joint[k, :, k] - np.outer(by_size, by_size)),
         "unused": 1 - coverage.share(shared),
     }
     lens = find_limiting_lens(J, joint, k, [free.index(p) for p in LENS])
     name = "" if lens is None else result.names[lens]
-    return CameraQuality(row.name, coverage, shared, figures, name, _rms_px(J, covariance.noise[k, :, k]))
+    noise_px = _rms_px(J, covariance.noise[k, :, k] - np.outer(by_size, by_size))
+    return CameraQuality(row.name, coverage, shared, figures, name, noise_px)
 
 
 def _rms_px(J: Array, covariance: Array) -> float:
     """Return the RMS image error per coordinate of points with Jacobians (n, 2, d), for a covariance (d, d)."""
     if not len(J):
         return float("nan")
-    return float(np.sqrt(np.einsum("nii->n", J @ covariance @ np.swapaxes(J, 1, 2)).mean() / 2))
+    return float(np.sqrt(max(np.einsum("nii->n", J @ covariance @ np.swapaxes(J, 1, 2)).mean() / 2, 0.0)))
 
 
 def find_limiting_lens(J: Array, joint: Array, k: int, lens: list[int]) -> int | None:
