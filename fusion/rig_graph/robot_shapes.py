@@ -32,12 +32,14 @@ class Shape:
         off: (m, 3) displacements, metres.
         frame: (6, 6) covariance of the robot's frame by errors of the places; see `frame_covariance`.
         exceeds: whether they are larger than the tolerance of a measurement explains.
+        contradicts: equations of the last window, if it contradicts those before.
     """
 
     equations: Equations
     off: Array
     frame: Array
     exceeds: bool
+    contradicts: Equations | None = None
 
 
 class RobotShapes:
@@ -61,7 +63,7 @@ class RobotShapes:
         """Forget the windows: they were judged by other cameras. The places in use stay."""
         for k, shape in self._known.items():
             H, y = shape.equations
-            self._known[k] = replace(shape, equations=(0 * H, 0 * y))
+            self._known[k] = replace(shape, equations=(0 * H, 0 * y), contradicts=None)
 
     def learned(self, windows: Mapping[int, Equations]) -> dict[int, Shape]:
         """The shapes of robots with what a window shows of each, about displacements from the places in use."""
@@ -94,6 +96,11 @@ class RobotShapes:
         known = self._known.get(robot)
         if known is not None and _agree(known.equations, (H, y)):
             H, y = known.equations[0] + H, known.equations[1] + y
+        elif known is not None:
+            # Roundels under wrong numbers show another shape for a moment; a marker that was displaced, from now on.
+            if known.contradicts is None or not _agree(known.contradicts, (H, y)):
+                return replace(known, contradicts=(H, y))
+            H, y = known.contradicts[0] + H, known.contradicts[1] + y
         off, covariance = posterior(H, y)
         return Shape((H, y), off, frame_covariance(places, covariance), _exceed_tolerance(H, y))
 

@@ -116,8 +116,9 @@ def test_a_robot_of_another_size_stays_as_it_is():
     assert not shapes.displaced_m
 
 
-def test_windows_add_and_one_that_contradicts_them_replaces_them():
-    """Of a marker that is displaced between two windows, the place in the second one is used."""
+def test_windows_add_and_two_that_contradict_them_replace_them():
+    """Of a marker that is displaced between two windows, the new place is used once a second window shows it. What one
+    window shows, such as two roundels under exchanged numbers, changes nothing."""
     rng = np.random.default_rng(0)
     off = one_off(FIVE, 0.01, rng)
     markers = table(FIVE)
@@ -126,6 +127,10 @@ def test_windows_add_and_one_that_contradicts_them_replaces_them():
         learn(shapes, {0: window(markers.position.T, FIVE - markers.position.T)})
     assert not shapes.displaced_m
     np.testing.assert_allclose(markers.position.T, FIVE, atol=1e-9)
+    exchanged = FIVE[[1, 0, 2, 3, 4]] - FIVE
+    for shown in (exchanged, 0 * off, off):
+        assert not learn(shapes, {0: window(FIVE, shown)})
+        np.testing.assert_allclose(markers.position.T, FIVE, atol=1e-9)
     assert learn(shapes, {0: window(FIVE, off)})
     np.testing.assert_allclose(markers.position.T - FIVE, off, atol=PLACE_M)
     shapes.forget()
