@@ -38,7 +38,7 @@ from calib.wand.detections import (
     count_frames,
     gather_background,
 )
-from calib.wand.focal_lengths import has_unknown, with_rough_focal_lengths
+from calib.wand.focal_lengths import with_rough_focal_lengths
 from calib.wand.initial_rig import (
     InitialRig,
     TwoViewGeometry,
@@ -461,13 +461,11 @@ def adjust_coarsely(recording: WandRecording, rough: RoughRig, budget: int = COA
     """Adjust poses, clocks and lenses on about `budget` frame sets, after a robust optimization of poses and clocks."""
     start = _build(recording, rough, budget)
     problem = start.problem.with_free(POSE, *clock_candidates(recording.timing))
-    # While unknown lenses are fixed, their errors would go into the wand's shape.
-    problem = replace(problem, estimates_shape=not has_unknown(recording.lenses))
     state = optimize_robustly(problem, start.observations, start.state)
     # Noise in the rough positions looks like acceleration: the first density makes the motion prior too weak, so the
     # motion absorbs noise and the residuals are too small.
     density = acceleration_density(problem.knot_s, state.motion[:, 0], recording.timing.gap_s)
-    problem = replace(problem.with_free(problem.free, LENS), density=density, estimates_shape=True)
+    problem = replace(problem.with_free(problem.free, LENS), density=density)
     observations = with_disc_centres(problem, state, start.observations, recording.wand)
     adjusted = with_readout_times(adjust(problem, observations, state), observations, recording.timing)
     return Solution(adjusted, observations)

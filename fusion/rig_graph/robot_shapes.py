@@ -94,13 +94,13 @@ class RobotShapes:
         places = self._places(robot)
         H, y = _of_any_size(places, H, y + H @ (self._used(robot) - places).ravel())
         known = self._known.get(robot)
-        if known is not None and _agree(known.equations, (H, y)):
-            H, y = known.equations[0] + H, known.equations[1] + y
-        elif known is not None:
+        if known is not None:
             # Roundels under wrong numbers show another shape for a moment; a marker that was displaced, from now on.
-            if known.contradicts is None or not _agree(known.contradicts, (H, y)):
+            before = [known.equations, *([known.contradicts] if known.contradicts else [])]
+            agreeing = next((equations for equations in before if _agree(equations, (H, y))), None)
+            if agreeing is None:
                 return replace(known, contradicts=(H, y))
-            H, y = known.contradicts[0] + H, known.contradicts[1] + y
+            H, y = agreeing[0] + H, agreeing[1] + y
         off, covariance = posterior(H, y)
         return Shape((H, y), off, frame_covariance(places, covariance), _exceed_tolerance(H, y))
 

@@ -17,9 +17,9 @@ from itertools import combinations
 import numpy as np
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from calib.rig.camera import PER_CAMERA, READOUT
+from calib.rig.camera import LENS, PER_CAMERA, READOUT
 from calib.rig.estimation import CAUCHY_SCALE, GROSS, coordinate_sigma
-from calib.wand.bundle_adjustment.covariance import inflation_factor
+from calib.wand.bundle_adjustment.covariance import FOCAL, inflation_factor
 from calib.wand.bundle_adjustment.problem import (
     Adjusted,
     Problem,
@@ -64,7 +64,12 @@ MIN_RELATIVE_INFORMATION = 2.0**-22
 
 
 def optimize_robustly(problem: Problem, observations: WandObservations, start: State) -> State:
-    """Optimize from a rough start with Cauchy's kernel."""
+    """Optimize from a rough start with Cauchy's kernel.
+
+    The wand's shape stays as it is while unknown lenses are fixed: their errors would go into it.
+    """
+    if LENS[0] not in problem.free and (problem.lens_sigma[:, 0] > FOCAL).any():
+        problem = replace(problem, estimates_shape=False)
     objective = _Objective(problem, observations, find_weights(problem, observations, start))
     return _levenberg_marquardt(objective, start, damping=1e-3, robust=True)[0]
 

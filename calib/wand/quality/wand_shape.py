@@ -5,7 +5,7 @@ Cameras measure the shape of the wand, not its size: that is the file's. Which o
 from the shape as far as their errors are few. The model: every marker's place in the file has an error of a common
 standard deviation, and one marker may have a larger one; both deviations, and which marker, are unknown. Given these,
 shape and size are jointly Gaussian. A wand of three markers does not show which of them is wrong, so that its size is
-as uncertain as its shape is wrong; one of four is outvoted by the other three.
+as uncertain as its shape is wrong; of four markers the wrong one is found, because the other three agree.
 """
 
 from dataclasses import dataclass
@@ -89,22 +89,23 @@ def infer_size(points: Array, shapes: Array, shape: Array, covariance: Array) ->
     """
     off = points - points.mean(axis=0)
     by_size = off / (off**2).sum()  # the size's change by each marker's place
-    sigma = PLACES * np.linalg.norm(points[:, None] - points, axis=2).max()
-    common, own = (grid.ravel() ** 2 for grid in np.meshgrid(sigma, sigma))
-    means, deviations, evidence = [], [], []
-    for by_marker, along in zip(np.swapaxes(shapes, 0, 1), by_size, strict=True):  # (n, 3) and (3,)
-        total = covariance + common[:, None, None] * np.eye(len(shape))
-        total = total + own[:, None, None] * (by_marker @ by_marker.T)
-        crossed = own[:, None] * (by_marker @ along)
-        solved = np.linalg.solve(total, np.stack([np.broadcast_to(shape, crossed.shape), crossed], axis=2))
-        variance = common * (by_size**2).sum() + own * (along @ along)
-        means.append((crossed * solved[:, :, 0]).sum(axis=1))
-        variance = variance - (crossed * solved[:, :, 1]).sum(axis=1)
-        deviations.append(np.sqrt(np.maximum(variance, PLACES[0] ** 2)))
-        evidence.append(-(np.linalg.slogdet(total)[1] + solved[:, :, 0] @ shape) / 2)
-    weight = np.exp(np.ravel(evidence) - np.max(evidence))
-    weight, means, deviations = weight / weight.sum(), np.ravel(means), np.ravel(deviations)
-    low, middle, high = (_quantile(p, means, deviations, weight) for p in ndtr([-1.0, 0.0, 1.0]))
+    variances = (PLACES * np.linalg.norm(points[:, None] - points, axis=2).max()) ** 2  # (k,)
+    e, V = np.linalg.eigh(covariance)
+    y, N = V.T @ shape, V.T @ np.swapaxes(shapes, 0, 1)  # (n,) and (M, n, 3)
+    # With the deviation of all places alone, k of them: what the shape shows of each marker's place.
+    D = 1 / (e + variances[:, None])
+    H = np.einsum("mni,kn,mnj->mkij", N, D, N, optimize=True)[:, :, None]
+    b = np.einsum("mni,kn->mki", N, D * y)[:, :, None, :, None]
+    # With the further deviation of one marker, on the third axis: Woodbury's identity.
+    K, along = H + np.eye(3) / variances[:, None, None], by_size[:, None, None, :, None]
+    of_shape, of_size = np.linalg.solve(K, b), np.linalg.solve(K, along)
+    mean = (along * of_shape).sum(axis=(3, 4))
+    variance = (along * of_size).sum(axis=(3, 4)) + variances[:, None] * (by_size**2).sum()
+    cost = (D @ y**2 - np.log(D).sum(axis=1))[:, None] - (b * of_shape).sum(axis=(3, 4))
+    cost = cost + np.linalg.slogdet(variances[:, None, None] * K)[1]
+    weight = np.exp((cost.min() - cost) / 2)
+    mixture = mean.ravel(), np.sqrt(variance).ravel(), (weight / weight.sum()).ravel()
+    low, middle, high = (_quantile(p, *mixture) for p in ndtr([-1.0, 0.0, 1.0]))
     return 1 + middle, (high - low) / 2
 
 

@@ -49,7 +49,7 @@ def velocity_of(scene: Scene, robot: str, t_s: float) -> Array:
 
 def test_robots_are_large_in_three_cameras_at_all_times(demo):
     """12 px is enough for the detectors of all peers; with three cameras a robot stays visible when one is occluded."""
-    for t_s in np.arange(demo.wave_s, demo.wave_s + 90, 0.5):
+    for t_s in np.arange(demo.wave_s, demo.wave_s + 90, 0.25):
         for name, (body, T) in demo.bodies_at(t_s).items():
             minors = [view_minor_px(camera, body, T) for camera in demo.cameras.values()]
             assert sum(minor >= 12 for minor in minors) >= 3, (name, t_s, minors)

@@ -97,7 +97,7 @@ def message_of(rows: list, **header) -> Detections:
         return Detections.pack(seen, width=800, height=600, **header)
 
 
-@settings(max_examples=15)
+@settings(max_examples=30)
 @given(
     columns,
     st.sampled_from([0, 1, -1, START_NS, START_NS + NS, START_NS + 3600 * NS, 2**62]),

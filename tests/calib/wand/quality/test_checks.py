@@ -62,7 +62,7 @@ def test_a_wand_that_was_measured_wrong_is_measured_by_the_cameras(
     wand: Body, marker: int, to: tuple[float, float, float]
 ):
     """By 1 to 10 mm, which displaced cameras by up to 180 mm. Their arrangement is as exact as with the true wand. Its
-    size is as uncertain as the wand, and as exact where three other markers outvote the wrong one."""
+    size is as uncertain as the wand, and as exact where three other markers agree against the wrong one."""
     arena = ring(4, wand=wand)
     messages = record(arena, 8.0, sigma_px=0.1, sized=False, numbered=True)
     markers = (*wand.markers[:marker], to, *wand.markers[marker + 1 :])

@@ -60,7 +60,7 @@ def test_the_size_is_as_wrong_as_it_claims(
 
 
 @pytest.mark.parametrize("points", [PLANE, SOLID], ids=["plane", "solid"])
-def test_one_wrong_marker_is_outvoted_by_three(points: Array):
+def test_one_wrong_marker_of_four_is_found(points: Array):
     """4 mm of 0.4 m are up to 1 % of the size; the noise of the shape, 0.05 mm, is 0.02 %."""
     rng = np.random.default_rng(2)
     off, claimed = np.array([infer(points, wrong_once(points, rng), rng) for _ in range(TRIALS)]).T
