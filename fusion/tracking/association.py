@@ -17,7 +17,9 @@ prediction P, and the density of all roundels in the image:
 
 A robot of which much is missing needs more than what its missing markers cost: log(1 - P_D) each, and at most the
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
-probability that it does now. A camera that alone shows most of what it usually sees elsewhere, all by one image shift,
+probability that it does now. In clutter, where other roundels are in a gate more often than a marker is missed, the
+nearest detection often is another's: there a camera's view of a robot is judged given what the other cameras see. A
+camera that alone shows most of what it usually sees elsewhere, all by one image shift,
 was moved: what it still shows near the predictions is not theirs.
 """
 
@@ -41,6 +43,7 @@ from fusion.model.observations import (
 )
 from fusion.model.states import States
 from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.rays import GATE
 
 UNASSIGNED_COST = 1e4  # of a marker without a detection: above any sum of costs within gates
 MAX_DETECTIONS = 1 << 32  # above the number of detections in any frame set
@@ -223,19 +226,31 @@ def _renumber(rows: Index) -> tuple[Index, int]:
     return new[rows] - 1, int(new[-1]) if len(new) else 0
 
 
+def _determinant(cov: Array) -> Array:
+    """(N,) of covariances (2, 2, N)."""
+    return cov[0, 0] * cov[1, 1] - cov[0, 1] * cov[1, 0]
+
+
 LEARNED = 8  # frames of a camera that define the usual number of detections of a robot
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
 # Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
 CHANGED = np.log(0.02)
+CLUTTERED = np.exp(MISSED)  # other roundels expected in a gate: there are more of them than of missed markers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Changes:
-    """Robots of which much is missing (R,), their views (R, C) that were empty before, and what is missing (R,)."""
+class _Doubts:
+    """Robots of which much is missing (R,), what that costs (R,), and views (R, C) that were empty before or are in
+    clutter."""
 
     fallen: Mask
-    unseen: Mask
     cost: Array
+    unseen: Mask
+    cluttered: Mask
+
+    @property
+    def views(self) -> Mask:
+        return self.unseen | self.cluttered
 
 
 class OwnDetections:
@@ -275,33 +290,55 @@ class OwnDetections:
         cost = np.maximum(missing * MISSED, CHANGED).sum(1)
         fallen = (count.sum(1) > 0) & (missing.sum(1) > count.sum(1))
         unseen = self._unseen & (count > 0) & ~fallen[:, None]
-        own = ~(fallen[robot] | unseen.ravel()[view] | displaced[view % self._shape[1]])
-        if fallen.any() or unseen.any():
-            own[self._accepted(given, view, own, _Changes(fallen, unseen, cost))] = True
+        cluttered = self._cluttered(given, view) & ~fallen[:, None]
+        doubts = _Doubts(fallen, cost, unseen, cluttered)
+        own = ~(fallen[robot] | doubts.views.ravel()[view] | displaced[view % self._shape[1]])
+        if fallen.any() or doubts.views.any():
+            own[self._accepted(given, view, own, doubts)] = True
         self._learn(self._count(view[own]), frames, given.tracked)
         return own
 
-    def _accepted(self, given: AssignedFrames, view: Index, certain: Mask, changes: _Changes) -> Index:
+    def _cluttered(self, given: AssignedFrames, view: Index) -> Mask:
+        """(R, C) views in which other roundels are expected in the gate of a marker."""
+        found, frame = np.zeros(self._shape, bool), given.detections.frame[given.assignments.detection]
+        density = self._density(
+            given.detections, np.delete(given.detections.frame, given.assignments.detection)
+        )
+        rows = np.flatnonzero(density[frame])
+        if len(rows):
+            observations = MatchedObservations.of(
+                given.assignments.select(rows), given.detections, self._markers
+            )
+            A, _ = self._estimator.innovations(given.states, observations)
+            P = given.states.P[observations.discs.body]
+            A = A.reshape(-1, 2, 12)
+            whitened = np.linalg.det(A @ P @ A.transpose(0, 2, 1) + np.eye(2))
+            area_px2 = np.pi * GATE * np.sqrt(whitened * _determinant(observations.detections.cov))
+            found.ravel()[view[rows[area_px2 * density[frame[rows]] > CLUTTERED]]] = True
+        return found
+
+    def _accepted(self, given: AssignedFrames, view: Index, certain: Mask, doubts: _Doubts) -> Index:
         """The uncertain assignments that are more probable as those of their robot.
 
         Args:
             given: N assignments of a frame set.
             view: (N,) of the assignments, robot and camera.
             certain: (N,) assignments that are not to be judged.
-            changes: the robots and views whose assignments are uncertain.
+            doubts: the robots and views whose assignments are uncertain.
         """
         n_cameras = self._shape[1]
-        rows = np.flatnonzero((changes.fallen | changes.unseen.any(1))[view // n_cameras])
+        rows = np.flatnonzero((doubts.fallen | doubts.views.any(1))[view // n_cameras])
         robot, camera = np.divmod(view[rows], n_cameras)
         observations = MatchedObservations.of(given.assignments.select(rows), given.detections, self._markers)
         A, nu = self._estimator.innovations(given.states, observations)
-        cov, frame = observations.detections.cov, observations.detections.frame
         # The density of other roundels, of pixels instead of whitened centres.
-        log_area = 0.5 * np.log(cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2)
-        other = log_area + np.log(self._density(given.detections)[frame])
-        fallen, (seen, by) = np.flatnonzero(changes.fallen), np.nonzero(changes.unseen)
+        density = self._density(given.detections, given.detections.frame)[observations.detections.frame]
+        other = np.log(np.sqrt(_determinant(observations.detections.cov)) * density)
+        fallen, (seen, by) = np.flatnonzero(doubts.fallen), np.nonzero(doubts.views)
         of_robot, of_camera = np.concatenate([fallen, seen]), np.concatenate([np.full(len(fallen), -1), by])
-        prior = np.concatenate([changes.cost[fallen] - CHANGED, np.full(len(seen), CHANGED)])
+        prior = np.concatenate(
+            [doubts.cost[fallen] - CHANGED, np.where(doubts.unseen[seen, by], CHANGED, 0.0)]
+        )
         evidence = A.reshape(-1, 2, 12), nu.reshape(-1, 2), other, robot, camera, certain[rows]
         ratio = _core.log_ratios(*evidence, given.states.P, of_robot, of_camera)
         accepted = np.zeros(self._shape, bool)
@@ -340,12 +377,10 @@ class OwnDetections:
             shown += len(mutual_nearest(expected + image_shift([expected], [uv]), uv, SHIFTED_PX)[0])
         return shown
 
-    def _density(self, detections: DetectionTable) -> Array:
-        """(F,) detections per pixel^2 in the frames up to the last one with a detection."""
-        counts = np.bincount(detections.frame)
-        lenses = [
-            self._cameras[self._cameras.names[k]] for k in detections.exposures.camera[: len(counts)].tolist()
-        ]
+    def _density(self, detections: DetectionTable, frame: Index) -> Array:
+        """(F,) detections per pixel^2 in each frame, of those in the frames (K,)."""
+        lenses = [self._cameras[self._cameras.names[k]] for k in detections.exposures.camera.tolist()]
+        counts = np.bincount(frame, minlength=len(lenses))
         return counts / np.array([lens.width * lens.height for lens in lenses], float)
 
     def _count(self, view: Index) -> Index:
