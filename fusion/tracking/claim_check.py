@@ -39,6 +39,9 @@ CLAIM_RATIO = 1.5  # of squared errors to claims: less does not change what a cl
 FALSE_ALARM = 1e-6  # of one comparison: one in a month of ten comparisons a second
 POSE_DEGREES = 6
 MIN_REDUNDANCY = 1.0  # of a frame set: with less, everything fits
+# Of the squared errors of one sample to their claims, where it is compared: a robot of which a detection was another's
+# in two samples of those that are remembered contradicts nothing.
+MAX_RATIO = (CLAIM_RATIO - 1) * MEMORY / 2
 log = logging.getLogger("fusion")
 
 
@@ -48,6 +51,7 @@ class _Sums:
 
     Attributes:
         squares: of residuals in claimed standard deviations.
+        bounded: the same, of each sample at most `MAX_RATIO` times what is expected.
         redundancy: what noise and the rig's errors make of them.
         rig: the part by the rig's errors.
         squares_m2: of the errors of detections at the distance of their markers, square metres.
@@ -55,6 +59,7 @@ class _Sums:
     """
 
     squares: Array
+    bounded: Array
     redundancy: Array
     rig: Array
     squares_m2: Array
@@ -62,25 +67,30 @@ class _Sums:
 
     @classmethod
     def zeros(cls, *shape: int) -> "_Sums":
-        return cls(*np.zeros((5, *shape)))
+        return cls(*np.zeros((6, *shape)))
 
     def add(self, row: int | tuple[int, int | Index], sample: tuple[float, ...]) -> None:
         """Add a sample to one row, or to several; those before it lose weight."""
-        columns = self.squares, self.redundancy, self.rig, self.squares_m2, self.count
+        columns = self.squares, self.bounded, self.redundancy, self.rig, self.squares_m2, self.count
         for column, value in zip(columns, sample, strict=True):
             column[row] += value - column[row] / MEMORY
 
     def ratio(self) -> Array:
         """Squared errors over their claims; 0 where nothing could contradict."""
+        return self._ratio(self.squares)
+
+    def _ratio(self, squares: Array) -> Array:
         expected = self.redundancy
-        return np.divide(self.squares, expected, out=np.zeros_like(expected), where=expected > 0)
+        return np.divide(squares, expected, out=np.zeros_like(expected), where=expected > 0)
 
     def contradicts(self) -> Mask:
         """Where the squared errors exceed their claims significantly."""
         expected = np.maximum(self.redundancy, 1e-9)
         degrees = expected**2 / (expected - self.rig + self.rig**2 / POSE_DEGREES)
         bound = chdtri(np.maximum(degrees, 1e-3), FALSE_ALARM) / np.maximum(degrees, 1e-3)
-        return (self.redundancy > MIN_REDUNDANCY) & (self.ratio() > np.maximum(CLAIM_RATIO, bound))
+        return (self.redundancy > MIN_REDUNDANCY) & (
+            self._ratio(self.bounded) > np.maximum(CLAIM_RATIO, bound)
+        )
 
 
 class ClaimCheck:
@@ -234,9 +244,10 @@ class _Equations:
         residual = self.nu - self.A @ x
         redundancy = len(J) - float(np.einsum("ni,ij,nj->", J, P, J))
         squares = (residual**2).sum(axis=1)
-        squares_m2 = squares * self.metres**2
+        squares_m2, whole = squares * self.metres**2, float(squares[used].sum())
         sample = (
-            float(squares[used].sum()),
+            whole,
+            min(whole, MAX_RATIO * redundancy),
             redundancy,
             redundancy * float(self.rig[used].mean()) if used.any() else 0.0,
             float(squares_m2[used].sum()),
