@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from camera_node.foundation.arrays import Array
-from fusion.model.marker_places import PLACE_M, frame_covariance
+from fusion.model.marker_places import PLACE_M, frame_covariance, motions
 from fusion.model.observations import MarkerTable
 from fusion.rig_graph.hypotheses import FALSE_ALARM, FREE_SHAPE_M, WAND_SIGMA
 
@@ -20,6 +20,7 @@ TOLERANCES_M = PLACE_M * 2.0 ** np.arange(7)  # of the places of markers, if the
 # Powers with which a larger tolerance of all markers, and of one, is less probable: the least that keep the claims of
 # robots of which windows show little below a millimetre.
 RARER, RARER_ONE = 2, 3
+ANY_MOTION = 1.0  # rad and m: of the frame of a robot against its markers
 N_GAUGE = 7  # motions of a robot and its size, which show no displacement
 
 
@@ -60,7 +61,8 @@ class RobotShapes:
         self._known = {row: old._known[k] for row, k in same.items() if k in old._known}
 
     def forget(self) -> None:
-        """Forget the windows: they were judged by other cameras. The places in use stay."""
+        """Forget the windows: they were judged by other cameras. The places in use stay until two windows contradict
+        them."""
         for k, shape in self._known.items():
             H, y = shape.equations
             self._known[k] = replace(shape, equations=(0 * H, 0 * y), contradicts=None)
@@ -92,12 +94,13 @@ class RobotShapes:
 
     def _learned(self, robot: int, H: Array, y: Array) -> Shape:
         places = self._places(robot)
-        H, y = _of_any_size(places, H, y + H @ (self._used(robot) - places).ravel())
+        H, y = _of_any_frame_and_size(places, H, y + H @ (self._used(robot) - places).ravel())
         known = self._known.get(robot)
         if known is not None:
             # Roundels under wrong numbers show another shape for a moment; a marker that was displaced, from now on.
             before = [known.equations, *([known.contradicts] if known.contradicts else [])]
-            agreeing = next((equations for equations in before if _agree(equations, (H, y))), None)
+            off = known.off.ravel()
+            agreeing = next((equations for equations in before if _agree(equations, (H, y), off)), None)
             if agreeing is None:
                 return replace(known, contradicts=(H, y))
             H, y = agreeing[0] + H, agreeing[1] + y
@@ -180,16 +183,24 @@ def _rarity(tolerance_m: float, power: int) -> float:
     return 2 * power * float(np.log(tolerance_m / PLACE_M))
 
 
-def _of_any_size(places: Array, H: Array, y: Array) -> Equations:
-    """The equations if the robot's size is unknown, since the rig may have another one."""
-    size = H @ places.ravel()
-    total = WAND_SIGMA**-2 + places.ravel() @ size
-    return H - np.outer(size, size) / total, y - size * (places.ravel() @ y) / total
+def _of_any_frame_and_size(places: Array, H: Array, y: Array) -> Equations:
+    """The equations if a robot's frame is anywhere in its markers, and if its size is unknown, as the rig may have
+    another one.
+
+    What a window shows of a motion that all markers have in common is by the directions of prints, which are not free,
+    and by what a linearization neglects: little, but a thousand windows would add it up.
+    """
+    G = np.column_stack([motions(places), places.ravel()])
+    HG, information = H @ G, np.diag([ANY_MOTION**-2] * 6 + [WAND_SIGMA**-2])
+    eliminated = np.linalg.solve(information + G.T @ HG, np.column_stack([HG.T, G.T @ y]))
+    return H - HG @ eliminated[:, :-1], y - HG @ eliminated[:, -1]
 
 
-def _agree(known: Equations, window: Equations) -> bool:
-    """Whether a window shows what those before did."""
+def _agree(known: Equations, window: Equations, off: Array) -> bool:
+    """Whether a window shows what those before did; if these are forgotten, the displacements (3 m,) in use."""
     (H_known, y_known), (H, y) = known, window
+    if not H_known.any():
+        return not _exceed_tolerance(H, y - H @ off)
     least = np.eye(len(y)) / FREE_SHAPE_M**2
     P = np.linalg.inv(H_known + least)
     off = y - H @ P @ y_known

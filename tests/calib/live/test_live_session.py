@@ -64,6 +64,7 @@ def sending(
         yield client, lambda: thread.join(20)
 
 
+@pytest.mark.ci
 def test_a_session_ends_when_a_trial_is_precise_enough():
     """20 s of recording at 0.02 px, all at once: by the first trial, pixel noise dominates."""
     arena, shown = ring(3), []
