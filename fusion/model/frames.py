@@ -91,7 +91,13 @@ def clock_sigma_s(error_us: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """Frames of all cameras near `t_ns`, each with its own capture time."""
+    """Frames of all cameras near `t_ns`, each with its own capture time.
+
+    Attributes:
+        judged: of a recording: how many judgements of the cameras, which run beside tracking, the server took after
+            this frame set. Where it is None, they are taken at once.
+    """
 
     t_ns: int
     frames: tuple[CalibratedFrame, ...]
+    judged: int | None = None

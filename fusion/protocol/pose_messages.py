@@ -275,7 +275,8 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
     """The frames of a frame set, so that a replay fuses the same frames as the server did.
 
     Columns, one row a frame: `stamps` (F,) <i8 the `t_ns` of its `Detections`; `times` (F,) <i8 its capture time as it
-    was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds.
+    was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds. `judged`: how many
+    judgements of the cameras, which run beside tracking, the server took after it; None of older servers.
     """
 
     version: int = VERSION
@@ -284,10 +285,11 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
     stamps: bytes
     times: bytes
     clock_sigmas: bytes
+    judged: int | None = None
 
     @classmethod
-    def of(cls, frame_set: FrameSet) -> "FusedFrames":
-        """The message of a frame set."""
+    def of(cls, frame_set: FrameSet, judged: int) -> "FusedFrames":
+        """The message of a frame set, after which so many judgements of the cameras were taken."""
         frames = frame_set.frames
         return cls(
             t_ns=frame_set.t_ns,
@@ -295,6 +297,7 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
             stamps=np.array([frame.stamp_ns for frame in frames], "<i8").tobytes(),
             times=np.array([frame.t_ns for frame in frames], "<i8").tobytes(),
             clock_sigmas=np.array([frame.clock_sigma_s for frame in frames], "<f8").tobytes(),
+            judged=judged,
         )
 
     def check(self) -> None:

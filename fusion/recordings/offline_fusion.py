@@ -27,6 +27,7 @@ from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusedFrames
 from fusion.recordings.arena_recording import DETECTIONS, FRAMES, ArenaRecording, skipped
+from fusion.rig_graph.rig_monitor import RecordedJudgements
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Refusal, admit
 from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult
@@ -160,6 +161,7 @@ def _fuse(
     frame_sets: Iterable[FrameSet], tracker: Tracker, arena: OfflineArena, summary: Summary
 ) -> Iterator[TrackingResult]:
     smoother = Smoother(tracker.table.names) if arena.smooth else None
+    judgements = RecordedJudgements()
     for frame_set in frame_sets:
         fused = tracker.track(frame_set)
         summary.add(fused)
@@ -167,6 +169,8 @@ def _fuse(
             yield fused
         else:
             yield from smoother.add(fused)
+        if frame_set.judged is not None:
+            tracker.monitors.rig.executor, judgements.allowed = judgements, frame_set.judged
         for correction in tracker.check_extrinsics(frame_set):
             summary.add_correction(correction, frame_set.t_ns)
     summary.not_acquired = tracker.not_acquired()
@@ -240,7 +244,7 @@ def recorded_frame_sets(
         if has_begun:
             if n_missing:
                 faults["frames that the server used and the recording does not hold"] += n_missing
-            yield FrameSet(fused.t_ns, frames)
+            yield FrameSet(fused.t_ns, frames, fused.judged)
 
 
 def _with_their_frames(recording: ArenaRecording) -> Iterator[tuple[FusedFrames, "Held"]]:

@@ -20,7 +20,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context, parent_process
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import msgspec
 import numpy as np
@@ -56,6 +56,7 @@ from fusion.rig_graph.refinement import Refinement
 from fusion.rig_graph.robot_shapes import RobotShapes, Shape
 
 log = logging.getLogger("fusion")
+P = ParamSpec("P")
 T = TypeVar("T")
 Equations = tuple[int, Array, Array]  # Unix time in ns, and H (8 C, 8 C) and y (8 C,) of `ClockWalk.update`
 Measured = tuple[Equations, dict[int, Shape]]  # and by row of the robots
@@ -101,6 +102,7 @@ class RigMonitor:
         self._cameras, self._markers = cameras, markers
         self._keyframes = Keyframes(cameras, markers, max(WINDOWS))
         self._job: Future[Judgement | None] | None = None
+        self._judged = 0  # jobs that were taken since they were asked for
         self._checked_ns = self._revision = self._n_undecided = 0
         self._pause_ns = 0  # after the last job
         self._is_contradicted = False
@@ -193,6 +195,11 @@ class RigMonitor:
         has_placed, self._has_placed = self._has_placed, False
         return has_placed
 
+    def take_judged(self) -> int:
+        """How many judgements were taken since the last call, for `RecordedJudgements`."""
+        judged, self._judged = self._judged, 0
+        return judged
+
     def jump(self, name: str, sigma_s: float, rate_sigma: float) -> None:
         """The stamps of a camera jumped, or may have; see `ClockWalk.jump`."""
         self._walk.jump(self._cameras.index[name], sigma_s, rate_sigma)
@@ -234,6 +241,7 @@ class RigMonitor:
     ) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         while self._job is not None and self._job.done():
             job, self._job = self._job, None
+            self._judged += 1
             if self._revision != self._cameras.revision:
                 return ()
             self._pause_ns = round((now_ns - self._checked_ns) / USUAL_SHARE)
@@ -501,6 +509,36 @@ class RigMonitor:
         self._clocks.clear()
         self._moments.clear()
         self._note_undecided(())
+
+
+class RecordedJudgements(Executor):
+    """Runs a judgement when a recorded server took it: that depends on how busy its machine was.
+
+    Attributes:
+        allowed: how many judgements may be taken from now on.
+    """
+
+    def __init__(self) -> None:
+        self.allowed = 0
+
+    def submit(self, job: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> "Future[T]":
+        """A future whose result is computed when it is taken."""
+        return _Recorded(self, partial(job, *args, **kwargs))
+
+
+class _Recorded(Future[T]):
+    """Is done as soon as its owner allows it."""
+
+    def __init__(self, owner: RecordedJudgements, job: Callable[[], T]) -> None:
+        super().__init__()
+        self._owner, self._run = owner, job
+
+    def done(self) -> bool:
+        return self._owner.allowed > 0
+
+    def result(self, timeout: float | None = None) -> T:
+        self._owner.allowed -= 1
+        return self._run()
 
 
 def _done(job: Callable[[], Judgement | None]) -> "Future[Judgement | None]":

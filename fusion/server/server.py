@@ -276,8 +276,10 @@ class Server:
             self._exchange(self.clock.now_ns())
         else:
             self.transport.publish(self.keys.markers, result.markers)
-            self.transport.publish(frames_key(self.keys.arena), FusedFrames.of(frame_set))
-        for correction in tracker.check_extrinsics(frame_set):
+        corrections, judged = tracker.check_extrinsics(frame_set), tracker.monitors.rig.take_judged()
+        if self.zones is None:
+            self.transport.publish(frames_key(self.keys.arena), FusedFrames.of(frame_set, judged))
+        for correction in corrections:
             self._report_correction(correction)
         for name in result.crowded:
             self.statistics.count_fault(TOO_MANY_UNASSIGNED, name)
