@@ -170,7 +170,8 @@ def _fuse(
         else:
             yield from smoother.add(fused)
         if frame_set.judged is not None:
-            tracker.monitors.rig.executor, judgements.allowed = judgements, frame_set.judged
+            tracker.monitors.rig.executor = judgements
+            judgements.allow(frame_set.judged)
         for correction in tracker.check_extrinsics(frame_set):
             summary.add_correction(correction, frame_set.t_ns)
     summary.not_acquired = tracker.not_acquired()

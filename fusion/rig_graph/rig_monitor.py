@@ -512,43 +512,40 @@ class RigMonitor:
 
 
 class RecordedJudgements(Executor):
-    """Runs a judgement when a recorded server took it: that depends on how busy its machine was.
-
-    Attributes:
-        allowed: how many judgements may be taken from now on.
-    """
+    """Runs a judgement when a recorded server took it: that depends on how busy its machine was."""
 
     def __init__(self) -> None:
-        self.allowed = 0
+        self._allowed = 0
+        self._release: Callable[[], None] | None = None  # the judgement that waits
 
     def submit(self, job: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> "Future[T]":
-        """A future whose result is computed when it is taken."""
-        return _Recorded(self, partial(job, *args, **kwargs))
+        """A future that `allow` makes done."""
+        future: Future[T] = Future()
+        self._release = partial(_run, future, partial(job, *args, **kwargs))
+        self.allow(self._allowed)
+        return future
+
+    def allow(self, n: int) -> None:
+        """From now on `n` judgements may be taken."""
+        self._allowed = n
+        if n > 0 and self._release is not None:
+            release, self._release = self._release, None
+            self._allowed -= 1
+            release()
 
 
-class _Recorded(Future[T]):
-    """Is done as soon as its owner allows it."""
-
-    def __init__(self, owner: RecordedJudgements, job: Callable[[], T]) -> None:
-        super().__init__()
-        self._owner, self._run = owner, job
-
-    def done(self) -> bool:
-        return self._owner.allowed > 0
-
-    def result(self, timeout: float | None = None) -> T:
-        self._owner.allowed -= 1
-        return self._run()
-
-
-def _done(job: Callable[[], Judgement | None]) -> "Future[Judgement | None]":
+def _done(job: Callable[[], T]) -> "Future[T]":
     """The result of a job that runs at once."""
-    future: Future[Judgement | None] = Future()
+    future: Future[T] = Future()
+    _run(future, job)
+    return future
+
+
+def _run(future: "Future[T]", job: Callable[[], T]) -> None:
     try:
         future.set_result(job())
     except Exception as error:  # as of a job elsewhere
         future.set_exception(error)
-    return future
 
 
 def judge_latest(
