@@ -72,6 +72,7 @@ def test_a_live_test_that_passes_at_its_second_run_is_unstable_and_the_run_is_gr
     assert all(text in collected for text in ("test_once", "too late", "not closed"))
 
 
+@pytest.mark.ci
 def test_a_live_test_that_fails_twice_is_red_and_a_computed_one_has_no_second_run(tmp_path: Path):
     files = {
         "live/test_broken.py": "def test_broken(): assert False, 'broken'\n",

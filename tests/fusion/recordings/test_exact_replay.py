@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import pytest
 
 from calib.rig.recording import read_messages
 from camera_node.protocol.messages import Detections, decode, encode
@@ -72,6 +73,7 @@ def content(path: Path, since_ns: int, until_ns: int) -> tuple[dict, dict]:
     )
 
 
+@pytest.mark.ci
 def test_a_replay_equals_the_live_server(tmp_path: Path):
     """From the first complete frame set on, although frames were lost, late and too late, and a camera was away."""
     path = tmp_path / "live.mcap"
