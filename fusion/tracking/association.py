@@ -17,10 +17,10 @@ prediction P, and the density of all roundels in the image:
 
 A robot of which much is missing needs more than what its missing markers cost: log(1 - P_D) each, and at most the
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
-probability that it does now. In clutter, where other roundels are in a gate more often than a marker is missed, the
-nearest detection often is another's: there a camera's view of a robot is judged given what the other cameras see. A
-camera that alone shows most of what it usually sees elsewhere, all by one image shift,
-was moved: what it still shows near the predictions is not theirs.
+probability that it does now. In clutter, where other roundels are expected in gates, the nearest detection may be
+another's: there a camera's view of a robot is judged given what the other cameras see. A camera that alone shows most
+of what it usually sees elsewhere, all by one image shift, was moved: what it still shows near the predictions is not
+theirs.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ from fusion.model.observations import (
     MarkerTable,
     MatchedObservations,
 )
-from fusion.model.states import States
+from fusion.model.states import POSITION, VELOCITY, States
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.rays import GATE
 
@@ -235,22 +235,18 @@ LEARNED = 8  # frames of a camera that define the usual number of detections of 
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
 # Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
 CHANGED = np.log(0.02)
-CLUTTERED = np.exp(MISSED)  # other roundels expected in a gate: there are more of them than of missed markers
+CLUTTERED = np.exp(CHANGED)  # other roundels expected in a gate: as probable there as what is judged anyway
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Doubts:
-    """Robots of which much is missing (R,), what that costs (R,), and views (R, C) that were empty before or are in
-    clutter."""
+    """Robots of which much is missing (R,), what that costs (R,), and views (R, C) with the logarithm of how probable
+    they are before they are seen."""
 
     fallen: Mask
     cost: Array
-    unseen: Mask
-    cluttered: Mask
-
-    @property
-    def views(self) -> Mask:
-        return self.unseen | self.cluttered
+    views: Mask
+    prior: float
 
 
 class OwnDetections:
@@ -290,31 +286,34 @@ class OwnDetections:
         cost = np.maximum(missing * MISSED, CHANGED).sum(1)
         fallen = (count.sum(1) > 0) & (missing.sum(1) > count.sum(1))
         unseen = self._unseen & (count > 0) & ~fallen[:, None]
-        cluttered = self._cluttered(given, view) & ~fallen[:, None]
-        doubts = _Doubts(fallen, cost, unseen, cluttered)
-        own = ~(fallen[robot] | doubts.views.ravel()[view] | displaced[view % self._shape[1]])
-        if fallen.any() or doubts.views.any():
-            own[self._accepted(given, view, own, doubts)] = True
+        cluttered = self._cluttered(given) & (count > 0) & ~fallen[:, None] & ~unseen
+        own = ~(fallen[robot] | (unseen | cluttered).ravel()[view] | displaced[view % self._shape[1]])
+        # What a camera did not see before is judged given all that others see.
+        for doubts in (
+            _Doubts(fallen, cost, cluttered, 0.0),
+            _Doubts(np.zeros_like(fallen), cost, unseen, CHANGED),
+        ):
+            if doubts.fallen.any() or doubts.views.any():
+                own[self._accepted(given, view, own, doubts)] = True
         self._learn(self._count(view[own]), frames, given.tracked)
         return own
 
-    def _cluttered(self, given: AssignedFrames, view: Index) -> Mask:
-        """(R, C) views in which other roundels are expected in the gate of a marker."""
-        found, frame = np.zeros(self._shape, bool), given.detections.frame[given.assignments.detection]
-        density = self._density(
-            given.detections, np.delete(given.detections.frame, given.assignments.detection)
+    def _cluttered(self, given: AssignedFrames) -> Mask:
+        """(R, C) views in which other roundels are expected in the gate of a marker, as wide as that of its robot."""
+        found, seen, states = np.zeros(self._shape, bool), given.detections, given.states
+        density = self._density(seen, np.delete(seen.frame, given.assignments.detection))
+        if not density.any():
+            return found
+        camera, tau = seen.exposures.camera, seen.exposures.tau
+        of_p, of_both, of_v = (
+            np.einsum("nii->n", states.P[:, a, b])[:, None]
+            for a, b in ((POSITION, POSITION), (POSITION, VELOCITY), (VELOCITY, VELOCITY))
         )
-        rows = np.flatnonzero(density[frame])
-        if len(rows):
-            observations = MatchedObservations.of(
-                given.assignments.select(rows), given.detections, self._markers
-            )
-            A, _ = self._estimator.innovations(given.states, observations)
-            P = given.states.P[observations.discs.body]
-            A = A.reshape(-1, 2, 12)
-            whitened = np.linalg.det(A @ P @ A.transpose(0, 2, 1) + np.eye(2))
-            area_px2 = np.pi * GATE * np.sqrt(whitened * _determinant(observations.detections.cov))
-            found.ravel()[view[rows[area_px2 * density[frame[rows]] > CLUTTERED]]] = True
+        variance = (of_p + 2 * tau * of_both + tau**2 * of_v) / 3
+        squared_m2 = np.sum((states.p[:, None] - self._cameras.centres[camera]) ** 2, axis=2)
+        area_px2 = np.pi * GATE * self._cameras.focal[camera] ** 2 * variance / squared_m2
+        robot, frame = np.nonzero(area_px2 * density > CLUTTERED)
+        found[robot, camera[frame]] = True
         return found
 
     def _accepted(self, given: AssignedFrames, view: Index, certain: Mask, doubts: _Doubts) -> Index:
@@ -336,9 +335,7 @@ class OwnDetections:
         other = np.log(np.sqrt(_determinant(observations.detections.cov)) * density)
         fallen, (seen, by) = np.flatnonzero(doubts.fallen), np.nonzero(doubts.views)
         of_robot, of_camera = np.concatenate([fallen, seen]), np.concatenate([np.full(len(fallen), -1), by])
-        prior = np.concatenate(
-            [doubts.cost[fallen] - CHANGED, np.where(doubts.unseen[seen, by], CHANGED, 0.0)]
-        )
+        prior = np.concatenate([doubts.cost[fallen] - CHANGED, np.full(len(seen), doubts.prior)])
         evidence = A.reshape(-1, 2, 12), nu.reshape(-1, 2), other, robot, camera, certain[rows]
         ratio = _core.log_ratios(*evidence, given.states.P, of_robot, of_camera)
         accepted = np.zeros(self._shape, bool)
