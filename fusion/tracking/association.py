@@ -311,8 +311,8 @@ class OwnDetections:
         )
         variance = (of_p + 2 * tau * of_both + tau**2 * of_v) / 3
         squared_m2 = np.sum((states.p[:, None] - self._cameras.centres[camera]) ** 2, axis=2)
-        area_px2 = np.pi * GATE * self._cameras.focal[camera] ** 2 * variance / squared_m2
-        robot, frame = np.nonzero(area_px2 * density > CLUTTERED)
+        gate = np.pi * GATE * self._cameras.focal[camera] ** 2 * variance  # px^2, at a distance of 1 m
+        robot, frame = np.nonzero(gate * density > CLUTTERED * squared_m2)
         found[robot, camera[frame]] = True
         return found
 
