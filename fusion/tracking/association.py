@@ -18,9 +18,9 @@ prediction P, and the density of all roundels in the image:
 A robot of which much is missing needs more than what its missing markers cost: log(1 - P_D) each, and at most the
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
 probability that it does now. In clutter, where other roundels are expected in gates, the nearest detection may be
-another's: there a camera's view of a robot is judged given what the other cameras see. So is a view of which most is
-missing, as that of a camera that turned. A camera that alone shows most of what it usually sees elsewhere, all by one
-image shift, was moved: what it still shows near the predictions is not theirs.
+another's: there a camera's view of a robot is judged given what the other cameras see. A camera that alone shows most
+of what it usually sees elsewhere, all by one image shift, was moved: what it still shows near the predictions is not
+theirs.
 """
 
 from collections.abc import Sequence
@@ -286,11 +286,11 @@ class OwnDetections:
         cost = np.maximum(missing * MISSED, CHANGED).sum(1)
         fallen = (count.sum(1) > 0) & (missing.sum(1) > count.sum(1))
         unseen = self._unseen & (count > 0) & ~fallen[:, None]
-        unsure = (self._cluttered(given) | (missing > count)) & (count > 0) & ~fallen[:, None] & ~unseen
-        own = ~(fallen[robot] | (unseen | unsure).ravel()[view] | displaced[view % self._shape[1]])
+        cluttered = self._cluttered(given) & (count > 0) & ~fallen[:, None] & ~unseen
+        own = ~(fallen[robot] | (unseen | cluttered).ravel()[view] | displaced[view % self._shape[1]])
         # What a camera did not see before is judged given all that others see.
         for doubts in (
-            _Doubts(fallen, cost, unsure, 0.0),
+            _Doubts(fallen, cost, cluttered, 0.0),
             _Doubts(np.zeros_like(fallen), cost, unseen, CHANGED),
         ):
             if doubts.fallen.any() or doubts.views.any():
