@@ -9,7 +9,7 @@ essential matrices. The sum of the tables and of the lenses' priors is the negat
 focal lengths. A grid has no local minimum that is missed, and where the sum is flat the priors decide.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -56,7 +56,7 @@ def with_rough_focal_lengths(rig: Rig, wand: Body, messages: Sequence[Detections
     Raises:
         CalibrationError: see `label_recording`.
     """
-    if not has_unknown(rig.cameras.values()):
+    if all(_focal_sigma(lens) <= FOCAL for lens in rig.cameras.values()):  # as known as by data sheets
         return rig
     recording = label_recording(rig, wand, messages)
     pairs = TwoViewGeometry(recording.detections, recording.lenses, wand, recording.timing)
@@ -67,11 +67,6 @@ def with_rough_focal_lengths(rig: Rig, wand: Body, messages: Sequence[Detections
         lens = cameras[name]
         cameras[name] = lens.with_parameters([factor * lens.fx, factor * lens.fy, *lens.parameters[2:]])
     return msgspec.structs.replace(rig, cameras=cameras)
-
-
-def has_unknown(lenses: Iterable[Lens]) -> bool:
-    """Whether a focal length is known less well than those of data sheets."""
-    return any(_focal_sigma(lens) > FOCAL for lens in lenses)
 
 
 def _focal_sigma(lens: Lens) -> float:

@@ -188,7 +188,7 @@ def _of_any_frame_and_size(places: Array, H: Array, y: Array) -> Equations:
     another one.
 
     What a window shows of a motion that all markers have in common is by the directions of prints, which are not free,
-    and by what a linearization neglects: little, but a thousand windows would add it up.
+    and by what a linearization neglects. It is little, so that no window contradicts those before by it.
     """
     G = np.column_stack([motions(places), places.ravel()])
     HG, information = H @ G, np.diag([ANY_MOTION**-2] * 6 + [WAND_SIGMA**-2])
@@ -203,8 +203,9 @@ def _agree(known: Equations, window: Equations, off: Array) -> bool:
         return not _exceed_tolerance(H, y - H @ off)
     least = np.eye(len(y)) / FREE_SHAPE_M**2
     P = np.linalg.inv(H_known + least)
-    off = y - H @ P @ y_known
-    cost = off @ np.linalg.solve(H + least, np.linalg.solve(np.eye(len(y)) + H @ P, off))
+    unexpected = y - H @ P @ y_known
+    solved = np.linalg.solve(np.eye(len(y)) + H @ P, unexpected)
+    cost = unexpected @ np.linalg.solve(H + least, solved)
     return bool(cost < chdtri(len(y), FALSE_ALARM))
 
 

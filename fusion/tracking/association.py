@@ -226,11 +226,6 @@ def _renumber(rows: Index) -> tuple[Index, int]:
     return new[rows] - 1, int(new[-1]) if len(new) else 0
 
 
-def _determinant(cov: Array) -> Array:
-    """(N,) of covariances (2, 2, N)."""
-    return cov[0, 0] * cov[1, 1] - cov[0, 1] * cov[1, 0]
-
-
 LEARNED = 8  # frames of a camera that define the usual number of detections of a robot
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
 # Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
@@ -301,9 +296,10 @@ class OwnDetections:
     def _cluttered(self, given: AssignedFrames) -> Mask:
         """(R, C) views in which other roundels are expected in the gate of a marker, as wide as that of its robot."""
         found, seen, states = np.zeros(self._shape, bool), given.detections, given.states
-        density = self._density(seen, np.delete(seen.frame, given.assignments.detection))
-        if not density.any():
+        others = np.delete(seen.frame, given.assignments.detection)
+        if not len(others):
             return found
+        density = self._density(seen, others)
         camera, tau = seen.exposures.camera, seen.exposures.tau
         of_p, of_both, of_v = (
             np.einsum("nii->n", states.P[:, a, b])[:, None]
@@ -330,9 +326,10 @@ class OwnDetections:
         robot, camera = np.divmod(view[rows], n_cameras)
         observations = MatchedObservations.of(given.assignments.select(rows), given.detections, self._markers)
         A, nu = self._estimator.innovations(given.states, observations)
+        cov, frame = observations.detections.cov, observations.detections.frame
         # The density of other roundels, of pixels instead of whitened centres.
-        density = self._density(given.detections, given.detections.frame)[observations.detections.frame]
-        other = np.log(np.sqrt(_determinant(observations.detections.cov)) * density)
+        log_area = 0.5 * np.log(cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2)
+        other = log_area + np.log(self._density(given.detections, given.detections.frame)[frame])
         fallen, (seen, by) = np.flatnonzero(doubts.fallen), np.nonzero(doubts.views)
         of_robot, of_camera = np.concatenate([fallen, seen]), np.concatenate([np.full(len(fallen), -1), by])
         prior = np.concatenate([doubts.cost[fallen] - CHANGED, np.full(len(seen), doubts.prior)])

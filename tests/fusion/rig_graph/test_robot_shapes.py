@@ -141,7 +141,7 @@ def test_windows_add_and_two_that_contradict_them_replace_them():
 
 
 def test_a_common_motion_of_all_markers_is_no_shape():
-    """However well windows show it, by the directions of prints: hundreds of them turned a robot by 12 mm."""
+    """However well a window shows it, by the directions of prints: one of swapped frames turned a robot by 12 mm."""
     M = motions(FOUR)
     shown = M @ M.T / NOISE_M**2
     H, y = window(FOUR, np.zeros_like(FOUR))
