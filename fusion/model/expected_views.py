@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The markers of tracked robots that a camera is certain to see, and where in its image; and the image shift by which a
-camera shows them elsewhere."""
+"""The markers of tracked robots that a camera is certain to see, and where in its image; and the motion of the camera
+that explains where it shows them instead."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
+from calib.rig.camera import Camera, pixel_jacobians
 from camera_node.foundation.arrays import Array, Index
+from camera_node.geometry.pose import Pose, rotation_from_vector
+from fusion.model.nearest import mutual_nearest
 from fusion.model.observations import CameraArray, Exposures, MarkerTable
 from fusion.model.states import States
 
@@ -15,6 +19,11 @@ MIN_FACING, MARGIN_PX = 0.35, 30.0  # of markers that a camera is certain to see
 SEARCH_PX = 120.0  # largest image shift: 8 degrees at a focal length of 840 px
 BIN_PX = 6.0
 SHIFTED_PX = 2 * BIN_PX  # from where a shift predicts them
+# Between expected and detected markers: robots that follow a camera at fault are expected pixels away, and discs of
+# other markers are at least their own diameter away.
+GATES_PX = (SHIFTED_PX, 10.0, 8.0, 8.0)
+ITERATIONS = 5
+MOVED, TURNED = 6, 3  # free errors of a camera's pose: its rotation is first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +74,56 @@ class ExpectedViews:
         return cls(rows[seen], points[:, seen], uv[seen])
 
 
-def image_shift(expected: Iterable[Array], detected: Iterable[Array]) -> Array:
+def match_moved(
+    camera: Camera, expected: Sequence[ExpectedViews], detected: Sequence[Array], free: int = MOVED
+) -> tuple[Array, list[tuple[Index, Index]]]:
+    """Find the motion of a camera by which it shows markers elsewhere.
+
+    An image shift on which most pairs agree begins, and pairs within ever smaller gates determine the pose.
+
+    Args:
+        camera: as calibrated.
+        expected: the markers of each frame.
+        detected: (M, 2) all roundels of each frame, pixels.
+        free: `MOVED`, or `TURNED` about its centre, which fewer markers determine.
+
+    Returns:
+        T_world_cam (4, 4), and rows of expected and of detected roundels by frame. Fewer pairs than free errors leave
+        the pose as calibrated, and are those of the shift.
+    """
+    T, shift = camera.matrix(), _image_shift([view.uv for view in expected], detected)
+    points = np.concatenate([view.points for view in expected], axis=1).T
+    of_frame = np.cumsum([len(view.rows) for view in expected])[:-1]
+    matches: list[tuple[Index, Index]] = []
+    for gate in GATES_PX:
+        moved = msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
+        uv = np.split(moved.project_world(points) + shift, of_frame)
+        matches = [mutual_nearest(there, seen, gate) for there, seen in zip(uv, detected, strict=True)]
+        shown = np.concatenate([v.points.T[rows] for v, (rows, _) in zip(expected, matches, strict=True)])
+        if len(shown) < free:
+            return camera.matrix(), matches
+        measured = np.concatenate([seen[d] for seen, (_, d) in zip(detected, matches, strict=True)])
+        T, shift = _fit_pose(camera, T, shown, measured, free), np.zeros(2)
+    return T, matches
+
+
+def _fit_pose(camera: Camera, T: Array, points: Array, measured: Array, free: int) -> Array:
+    """T_world_cam (4, 4) for the images (N, 2) of points (N, 3), by Gauss-Newton from `T` with Cauchy weights, 1 px."""
+    for _ in range(ITERATIONS):
+        uv, _, J, _ = pixel_jacobians(camera, (points - T[:3, 3]) @ T[:3, :3])
+        known = np.isfinite(uv).all(1)
+        J, off = J[known, :, :free], (measured - uv)[known]
+        weighted = J / (1 + np.sum(off**2, 1))[:, None, None]
+        H = np.einsum("nai,naj->ij", weighted, J) + 1e-9 * np.eye(free)
+        step = np.zeros(MOVED)
+        step[:free] = np.linalg.solve(H, np.einsum("nai,na->i", weighted, off))
+        T = T.copy()
+        T[:3, 3] += T[:3, :3] @ step[3:]
+        T[:3, :3] = T[:3, :3] @ rotation_from_vector(step[:3])
+    return T
+
+
+def _image_shift(expected: Sequence[Array], detected: Sequence[Array]) -> Array:
     """(2,) the image shift on which most pairs of expected and detected roundels agree, pixels.
 
     Args:

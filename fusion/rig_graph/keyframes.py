@@ -11,15 +11,14 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 from scipy.special import chdtri
 
-from calib.rig.camera import FOCAL_STABILITY, Camera, pixel_jacobians
+from calib.rig.camera import FOCAL_STABILITY, Camera
 from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index, Mask
-from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_rotation
-from fusion.model.expected_views import ExpectedViews, image_shift
+from camera_node.geometry.pose import rotation_from_vector, vector_from_rotation
+from fusion.model.expected_views import GATES_PX, ExpectedViews, match_moved
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.nearest import mutual_nearest
 from fusion.model.observations import (
@@ -38,11 +37,7 @@ HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its 
 # density times HALF / 6, and times HALF / 24.
 WIDER = 4.0
 MAX_ROBOTS = 4  # of a keyframe; the next one has others
-# Between expected and detected markers: robots that follow a camera at fault are expected pixels away, and discs of
-# other markers are at least their own diameter away.
-GATES_PX = (16.0, 10.0, 8.0, 8.0)
 FOUND = 0.8  # of the expected markers within the last gate: detections need no other assignment
-ITERATIONS = 5
 N_MEAN, N_PREDICTED = 3, 15  # moments of a mean motion, and those that show how well it predicts
 MIN_SEEN = 4  # detections of a robot in a keyframe: 8 equations of its pose, 6
 NEGLIGIBLE = 1e-6  # share of free errors, that keeps covariances of exact cameras regular
@@ -51,19 +46,10 @@ OFFSET_SIGMA_S = 5e-4  # of a calibrated clock offset, beside what the stamps cl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameView:
-    """A frame with the markers that it should show by the calibration.
-
-    Attributes:
-        frame: the frame.
-        rows: (N,) of the marker table.
-        points: (3, N) world frame, which project to the centres of their outlines.
-        uv: (N, 2) these centres, pixels.
-    """
+    """A frame, and the markers that it should show by the calibration."""
 
     frame: CalibratedFrame
-    rows: Index
-    points: Array
-    uv: Array
+    expected: ExpectedViews
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,8 +185,8 @@ def _view(
     scene: tuple[CameraArray, MarkerTable], frame: CalibratedFrame, t_ns: int, states: States, rows: Index
 ) -> FrameView:
     (cameras, markers), tau = scene, (frame.t_ns - t_ns) * 1e-9
-    seen = ExpectedViews.of(cameras, frame.camera, states, tau, (markers, rows), frame.readout_s)
-    return FrameView(frame, seen.rows, seen.points, seen.uv)
+    scene_at = cameras, frame.camera, states, tau, (markers, rows)
+    return FrameView(frame, ExpectedViews.of(*scene_at, frame.readout_s))
 
 
 def _predicted(states: States, velocities: Array, dt: float) -> States:
@@ -237,7 +223,7 @@ def window_of(
         inverse = np.linalg.inv(cameras[name].matrix()) @ T
         starts[k, :3], starts[k, 3:6] = vector_from_rotation(inverse[None, :3, :3])[0], inverse[:3, 3]
         for (number, view), (rows, detections) in zip(views, matches, strict=True):
-            found[number].append((view.frame, view.rows[rows], detections))
+            found[number].append((view.frame, view.expected.rows[rows], detections))
     return _assemble(keyframes, found, cameras, markers), starts
 
 
@@ -252,50 +238,19 @@ def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tupl
     Views that show their markers where the calibration expects them need no other pose: a camera that was moved in the
     meantime has some of both kinds.
     """
-    T, matches = camera.matrix(), [mutual_nearest(v.uv, v.frame.roundels.uv, GATES_PX[-1]) for v in views]
-    others = [k for k, v in enumerate(views) if len(matches[k][0]) < FOUND * len(v.rows)]
-    if sum(len(views[k].rows) for k in others) < ERRORS:
+    T, matches = (
+        camera.matrix(),
+        [mutual_nearest(v.expected.uv, v.frame.roundels.uv, GATES_PX[-1]) for v in views],
+    )
+    others = [k for k, v in enumerate(views) if len(matches[k][0]) < FOUND * len(v.expected.rows)]
+    if sum(len(views[k].expected.rows) for k in others) < ERRORS:
         return T, matches
-    T, found = _match_moved(camera, [views[k] for k in others])
+    T, found = match_moved(
+        camera, [views[k].expected for k in others], [views[k].frame.roundels.uv for k in others]
+    )
     for k, match in zip(others, found, strict=True):
         matches[k] = match if len(match[0]) >= len(matches[k][0]) else matches[k]
     return T, matches
-
-
-def _match_moved(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tuple[Index, Index]]]:
-    """The same for views that show their markers elsewhere."""
-    T, matches = camera.matrix(), [(np.empty(0, np.intp), np.empty(0, np.intp)) for _ in views]
-    shift = image_shift((view.uv for view in views), (view.frame.roundels.uv for view in views))
-    points = np.concatenate([view.points for view in views], axis=1).T
-    of_view = np.cumsum([len(view.rows) for view in views])[:-1]
-    for gate in GATES_PX:
-        moved = msgspec.structs.replace(camera, T_world_cam=Pose.from_matrix(T))
-        expected = np.split(moved.project_world(points) + shift, of_view)
-        matches = [
-            mutual_nearest(uv, v.frame.roundels.uv, gate) for uv, v in zip(expected, views, strict=True)
-        ]
-        pairs = list(zip(views, matches, strict=True))
-        shown = np.concatenate([v.points.T[rows] for v, (rows, _) in pairs])
-        if len(shown) < ERRORS:
-            return camera.matrix(), matches
-        T = _fit_pose(camera, T, shown, np.concatenate([v.frame.roundels.uv[d] for v, (_, d) in pairs]))
-        shift = np.zeros(2)
-    return T, matches
-
-
-def _fit_pose(camera: Camera, T: Array, points: Array, measured: Array) -> Array:
-    """T_world_cam (4, 4) for the images (N, 2) of points (N, 3), by Gauss-Newton from `T` with Cauchy weights, 1 px."""
-    for _ in range(ITERATIONS):
-        uv, _, J, _ = pixel_jacobians(camera, (points - T[:3, 3]) @ T[:3, :3])
-        known = np.isfinite(uv).all(1)
-        J, off = J[known], (measured - uv)[known]
-        weighted = J / (1 + np.sum(off**2, 1))[:, None, None]
-        H = np.einsum("nai,naj->ij", weighted, J) + 1e-9 * np.eye(6)
-        step = np.linalg.solve(H, np.einsum("nai,na->i", weighted, off))
-        T = T.copy()
-        T[:3, 3] += T[:3, :3] @ step[3:]
-        T[:3, :3] = T[:3, :3] @ rotation_from_vector(step[:3])
-    return T
 
 
 def _assemble(

@@ -19,7 +19,7 @@ A robot of which much is missing needs more than what its missing markers cost: 
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
 probability that it does now. In clutter, where other roundels are expected in gates, the nearest detection may be
 another's: there a camera's view of a robot is judged given what the other cameras see. A camera that alone shows most
-of what it usually sees elsewhere, all by one image shift, was moved: what it still shows near the predictions is not
+of what it usually sees elsewhere, all by one turn, was moved: what it still shows near the predictions is not
 theirs.
 """
 
@@ -31,9 +31,8 @@ from scipy.optimize import linear_sum_assignment
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.expected_views import SHIFTED_PX, ExpectedViews, image_shift
+from fusion.model.expected_views import TURNED, ExpectedViews, match_moved
 from fusion.model.frames import CalibratedFrame, FrameSet
-from fusion.model.nearest import mutual_nearest
 from fusion.model.observations import (
     Assignments,
     CameraArray,
@@ -342,8 +341,8 @@ class OwnDetections:
         return rows[accepted[robot, camera] & ~certain[rows]]
 
     def _find_displaced(self, given: AssignedFrames, count: Index, missing: Array) -> Mask:
-        """(C,) the cameras in which most markers that they usually show are elsewhere, all by one image shift, while
-        another camera shows these robots where they are predicted.
+        """(C,) the cameras in which most markers that they usually show are elsewhere, all by one turn, while another
+        camera shows these robots where they are predicted.
 
         Args:
             given: a frame set.
@@ -357,19 +356,18 @@ class OwnDetections:
             if not (count[of_others].sum(0) > missing[of_others].sum(0)).any():
                 continue
             rows = np.flatnonzero(robots[self._markers.robot])
-            elsewhere = self._shifted(given, k, rows)
+            elsewhere = self._shown_elsewhere(given, k, rows)
             found[k] = elsewhere > max((count + missing)[:, k].sum() / 2, count[:, k].sum())
         return found
 
-    def _shifted(self, given: AssignedFrames, camera: int, rows: Index) -> int:
-        """How many of the markers `rows` the frames of a camera show by one image shift."""
-        exposures, seen, shown = given.detections.exposures, given.detections, 0
-        for frame in np.flatnonzero(exposures.camera == camera).tolist():
-            tau, uv = float(exposures.tau[frame]), seen.uv[:, seen.frame == frame].T
-            scene = self._cameras, self._cameras.names[camera], given.states, tau, (self._markers, rows)
-            expected = ExpectedViews.of(*scene).uv
-            shown += len(mutual_nearest(expected + image_shift([expected], [uv]), uv, SHIFTED_PX)[0])
-        return shown
+    def _shown_elsewhere(self, given: AssignedFrames, camera: int, rows: Index) -> int:
+        """How many of the markers `rows` the frames of a camera show where one turn of it explains."""
+        name, seen = self._cameras.names[camera], given.detections
+        frames = np.flatnonzero(seen.exposures.camera == camera)
+        scene = self._cameras, name, given.states
+        expected = [ExpectedViews.of(*scene, seen.exposures.tau[k], (self._markers, rows)) for k in frames]
+        detected = [seen.uv[:, seen.frame == k].T for k in frames]
+        return sum(len(shown) for shown, _ in match_moved(self._cameras[name], expected, detected, TURNED)[1])
 
     def _density(self, detections: DetectionTable, frame: Index) -> Array:
         """(F,) detections per pixel^2 in each frame, of those in the frames (K,)."""
