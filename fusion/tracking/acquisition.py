@@ -13,7 +13,6 @@ from camera_node.foundation.arrays import Index
 from fusion._core import SLACK_PX
 from fusion.model.observations import Assignments, CameraArray, DetectionTable, mean_by_body
 from fusion.model.robots import Robot
-from fusion.model.states import States
 from fusion.tracking.constellation_search import MIN_MARKERS, TriangulatedMarkers, search
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import MAX_CHI2
@@ -38,7 +37,7 @@ class Acquired:
     """The result of an acquisition.
 
     Attributes:
-        rows, states: acquired robots and where they are.
+        fits: of the acquired robots.
         displaced: single-marker robots whose detections belong to an acquired constellation.
         assignments: of all robots, including the acquired ones.
         markers: triangulated markers that stay unlabeled.
@@ -46,8 +45,7 @@ class Acquired:
         crowded: cameras whose unassigned detections were too many to search all of them.
     """
 
-    rows: Index
-    states: States
+    fits: tuple[RefinedFits, ...]
     displaced: Index
     assignments: Assignments
     markers: list[Marker]
@@ -90,8 +88,7 @@ class Acquisition:
         """
         if not len(missing):
             markers, crowded = self.search.find(table.markers, 0, detections, assignments)
-            none = table.states.select(missing)
-            return Acquired(missing, none, missing, assignments, markers, {}, crowded)
+            return Acquired((), missing, assignments, markers, {}, crowded)
         named, left = missing[table.coded[missing]], missing[~table.coded[missing]]
         by_name, why_not = self._acquire_named(table, named, detections, assignments)
         assignments = assignments.joined(*(fits.assignments for fits in by_name))
@@ -114,8 +111,7 @@ class Acquisition:
             found, markers = [*found, more], _without(markers, more.assignments)
             assignments = assignments.joined(more.assignments)
         return Acquired(
-            np.concatenate([missing[:0], *(fits.robot for fits in found)]),
-            table.states.select(missing[:0]).joined(*(fits.states for fits in found)),
+            tuple(fits for fits in found if len(fits)),
             table.markers.robot[displaced],
             assignments,
             markers,

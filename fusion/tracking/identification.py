@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
-from fusion.model.observations import Assignments
+from fusion.model.observations import Assignments, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import VELOCITY, States
 from fusion.tracking.constellation_search import (
@@ -68,6 +68,7 @@ class RefinedFits:
             for others.
         shared: (K,) shares of their markers that a frame detects on average, of the frames that detect one of them.
         assignments, body: detections, and the fit of each.
+        observations, equations, weights: of the assignments, row by row, as of `BodyFit`.
     """
 
     robot: Index
@@ -79,6 +80,9 @@ class RefinedFits:
     shared: Array
     assignments: Assignments
     body: Index
+    observations: MatchedObservations
+    equations: Array
+    weights: Array
 
     def __len__(self) -> int:
         return len(self.robot)
@@ -96,6 +100,9 @@ class RefinedFits:
             self.shared[rows],
             self.assignments.select(used),
             number[self.body[used]],
+            self.observations.select(used),
+            self.equations[used],
+            self.weights[used],
         )
 
 

@@ -15,6 +15,7 @@ of the cameras. It is exact for any gain, so also for robust weights. docs/desig
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from fusion import _core
 from fusion.model.observations import MatchedObservations
 from fusion.model.states import States, Transition
 from fusion.tracking.estimator import Estimator
+from fusion.tracking.identification import RefinedFits
 from fusion.tracking.robust_update import RobustFit
 
 
@@ -59,21 +61,19 @@ class RigResponse:
         """The errors of robots (rows) that start from a state of unknown origin follow none of the cameras."""
         self.responses[rows], self.counted[rows] = 0.0, 0.0
 
-    def restart(self, states: States, rows: Index, observations: MatchedObservations) -> None:
-        """Robots (rows) that these observations located, without a prediction.
+    def restart(self, states: States, fits: RefinedFits) -> None:
+        """Robots that were located without a prediction.
 
         Args:
-            states: of all robots, after the observations.
-            rows: the robots.
-            observations: of these only.
+            states: of all robots, with those of the fits.
+            fits: of the robots.
         """
-        self.forget(rows)
-        A, nu = self._estimator.innovations(states, observations)
-        equations = np.concatenate([A, nu[:, None]], 1).reshape(-1, 2, 13)
-        weights = 1 / (_core.NOMINAL_WEIGHT * (1 + np.sum(equations[:, :, 12] ** 2, 1) / _core.CAUCHY**2))
-        n = len(states)
+        self.forget(fits.robot)
+        discs = replace(fits.observations.discs, body=fits.robot[fits.body])
+        observations, n = replace(fits.observations, discs=discs), len(states)
         at_rest = Transition(np.zeros((n, 3, 3)), np.zeros(n))
-        self._follow(states, observations, (equations, weights), (np.zeros((n, 12, 12)), at_rest), 0.0)
+        unknown = np.zeros((n, 12, 12)), at_rest
+        self._follow(states, observations, (fits.equations, fits.weights), unknown, 0.0)
 
     def _follow(
         self,

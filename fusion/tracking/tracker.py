@@ -13,7 +13,7 @@ from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.marker_places import PLACE_M
-from fusion.model.observations import Assignments, CameraArray, DetectionTable, MatchedObservations
+from fusion.model.observations import Assignments, CameraArray, DetectionTable
 from fusion.model.robots import Robot
 from fusion.model.states import Snapshot
 from fusion.monitoring.camera_monitors import CameraMonitors
@@ -276,15 +276,11 @@ class Tracker:
             self.table, missing, update.detections, update.assignments, histories
         )
         self._reasons = found.reasons
-        self.table.adopt(found.rows, found.states)
+        for fits in found.fits:
+            self.table.adopt(fits.robot, fits.states)
+            self.rig_response.restart(self.table.states, fits)
         self.table.lose(found.displaced)
-        if len(found.rows):
-            mine = np.isin(self.table.markers.robot[found.assignments.marker], found.rows)
-            self.rig_response.restart(
-                self.table.states,
-                found.rows,
-                MatchedObservations.of(found.assignments.select(mine), update.detections, self.table.markers),
-            )
+        if found.fits:
             self._claim()
         if len(found.assignments) != len(update.assignments):
             self.table.observe(update.t_ns, found.assignments)

@@ -180,23 +180,27 @@ def refine(
     observations = replace(observations, discs=replace(observations.discs, body=body))
     estimator = estimator.select(starts.robot)
     prediction = estimator.predict(starts.states, np.full(n, START_S))
-    states, squared_px = estimator.update(prediction, observations, SMALL)
-    d2 = observations.misfit(squared_px)
+    prepared = estimator.prepared(prediction.states, observations)
+    fit = estimator.fit(prediction, prepared, SMALL)
+    d2 = observations.misfit(fit.squared_px)
     rows = starts.robot.tolist()
     history = np.array(
-        [table.history_chi2(k, p, np.zeros((3, 3))) for k, p in zip(rows, states.p, strict=True)]
+        [table.history_chi2(k, p, np.zeros((3, 3))) for k, p in zip(rows, fit.states.p, strict=True)]
     )
     is_expected = (history < POSITION_GATE) & np.array([table.is_local(k) for k in rows], bool)
     return RefinedFits(
         starts.robot,
-        states,
+        fit.states,
         np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
         mean_by_body(d2, body, n),
         is_expected,
-        explained_shares(estimator.cameras, table.markers, detections, starts.robot, states),
+        explained_shares(estimator.cameras, table.markers, detections, starts.robot, fit.states),
         shared_views(starts.assignments, body, detections, n),
-        starts.assignments.with_residuals(squared_px),
+        starts.assignments.with_residuals(fit.squared_px),
         body,
+        prepared,
+        fit.equations,
+        fit.weights,
     )
 
 

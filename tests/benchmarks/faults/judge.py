@@ -131,6 +131,7 @@ class PoseJudge:
         if error_m <= self.max_error_m:
             return
         covariance = pose.covariance_matrix[POSITION, POSITION]
-        sigmas = float(np.sqrt(error @ np.linalg.solve(covariance, error)))
+        is_claim = np.linalg.eigvalsh(covariance)[0] > 0
+        sigmas = float(np.sqrt(error @ np.linalg.solve(covariance, error))) if is_claim else np.inf
         if sigmas > MAX_SIGMAS and len(self.wrong) < LONGEST:
             self.wrong.append(WrongPose(pose.robot, now_s, error_m, sigmas, cameras))

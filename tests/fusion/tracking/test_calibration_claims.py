@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Published poses claim the errors of the rig: over many calibrations and places, not along one run."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -13,7 +15,8 @@ from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.fusion_load import START_NS, Load, Scene
-from tests.fusion.synthetic import measured
+from tests.fusion.synthetic import TRIANGLE, Arena, line, measured
+from tests.fusion.tracks import poses_of, track
 
 RIGS, FRAMES, HZ = 30, 8, 30.0
 FALSE_ALARM = 1e-3  # of one test
@@ -77,3 +80,16 @@ def test_the_errors_of_the_rig_are_claimed(markers: int, sigma_px: float, states
         squares.append(squared_error(load, cameras, rng))
     low, high = chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 3 * RIGS)
     assert low < np.sum(squares) < high, np.mean(squares) / 3
+
+
+@pytest.mark.parametrize("clock_sigma_s", [5e-4, 5e-3, 2e-2])
+def test_a_covariance_is_positive_from_the_first_pose_on(clock_sigma_s: float):
+    """The noise of the clock hides the errors of the rig: before, an acquired robot counted them as if it did not, and
+    claimed less than nothing."""
+    motion = line((0.1, -0.2, 0.3), (0.8, 0.3, 0.0), turn=(0, 0, 0.5))
+    arena = Arena({"a": TRIANGLE}, {"a": motion}, sigma_px=0.1)
+    frames = [replace(frame, clock_sigma_s=clock_sigma_s) for frame in arena.frames(6)]
+    P = np.array([pose.covariance_matrix for pose in poses_of(track(arena, frames), "a")])
+    assert len(P)
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    assert (np.linalg.eigvalsh(P / (sigma[:, :, None] * sigma[:, None])) > 0).all()
