@@ -56,6 +56,6 @@ def test_a_moved_camera_is_found_from_several_frames():
 def test_too_few_markers_leave_the_pose_as_calibrated():
     """Two determine a shift, and it pairs them."""
     expected = scene(2, 0)
-    T, ((rows, found),) = match_moved(CAMERA, [expected], [expected.uv + (50.0, -20.0)], TURNED)
+    T, ((rows, found),) = match_moved(CAMERA, [expected], [expected.uv + np.array([50.0, -20.0])], TURNED)
     assert np.array_equal(T, CAMERA.matrix())
     assert rows.tolist() == found.tolist() == [0, 1]
