@@ -30,6 +30,7 @@ from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.installation import Installation, installation
 from fusion.protocol.pose_messages import FusedFrames, FusionStatus, RobotPose, Robots, robots_key
+from fusion.recordings.context import INSTALLATION
 from fusion.recordings.rotation import RotatingWriter
 
 log = logging.getLogger("fusion.recording")
@@ -45,7 +46,6 @@ PICTURE_S = 1.0  # between two pictures of a public recording
 ANSWER_S = 10.0
 NO_ROBOTS = "no robot is declared: a replay of this recording needs --robots robots.yaml"
 DETECTIONS, POSE, FRAMES = "/detections", "/pose", "/fusion/frames"  # the ends of keys
-INSTALLATION = "/recording"
 KINDS = {DETECTIONS: Detections, POSE: RobotPose, FRAMES: FusedFrames}
 
 

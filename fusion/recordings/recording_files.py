@@ -13,6 +13,7 @@ from calib.rig.recording_reader import RecordingReader
 from camera_node.foundation.config import require_name
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
+from fusion.recordings.context import Context
 
 KEY = re.compile(r".+?/(camera|robot)/([^/]+)/(?:detections|pose)")
 MAX_FILES = 200  # of one folder, the newest
@@ -108,14 +109,6 @@ def _require_recording(path: Path) -> None:
         )
 
 
-CONTEXT = (
-    "/rig",
-    "/robots",
-    "/status",
-    "/recording",
-)  # ends of keys whose latest message before the part still holds in it
-
-
 def say_skipped(faults: Counter[str]) -> None:
     """Print what of a recording was skipped, one line a reason."""
     for reason, count in sorted(faults.items()):
@@ -131,7 +124,7 @@ def trim_recording(
     overwrite: bool = False,
 ) -> int:
     """Write the messages that arrived from `from_s` to `to_s` after the first one, and what held at `from_s`: the
-    rig, the robots and the states of the cameras and the server. `faults` counts what could not be read.
+    rig, the robots and the states of the cameras and the server (`Context`). `faults` counts what could not be read.
 
     Returns:
         the number of messages in the part.
@@ -162,12 +155,12 @@ def _part(
     recording: Path, begin_ns: int, end_ns: int, faults: Counter[str]
 ) -> Iterator[tuple[bool, tuple[str, bytes, int]]]:
     """Messages that arrived in a part, each with whether it is older and holds in the part, if there are any."""
-    context: dict[str, bytes] = {}
+    context = Context()
     for key, data, t_ns in read_messages(recording, faults):
-        if t_ns < begin_ns and key.endswith(CONTEXT):
-            context[key] = data
-        if begin_ns <= t_ns <= end_ns:
-            for earlier, held in context.items():
+        if t_ns < begin_ns:
+            context.add(key, data)
+        elif t_ns <= end_ns:
+            for earlier, held in context.held.items():
                 yield True, (earlier, held, begin_ns)
-            context = {}
+            context.held.clear()
             yield False, (key, data, t_ns)

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from calib.rig.recording import RecordingWriter
 from camera_node.foundation.errors import ConfigError
-
-REPEATED = ("/rig", "/robots", "/recording")  # ends of keys whose latest message begins each file
+from fusion.recordings.context import Context
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class RotatingWriter:
     def __init__(self, path: Path, rotation: Rotation) -> None:
         self.counts: Counter[str] = Counter()  # of messages in all files, by key
         self._path, self._rotation = path, rotation
-        self._repeated: dict[str, bytes] = {}
+        self._context = Context()
         self._number = last_number(path)
 
     def __enter__(self) -> "RotatingWriter":
@@ -72,12 +71,11 @@ class RotatingWriter:
         if self._rotation.is_due(self._writer.size, time.monotonic() - self._begun_s):
             self._writer.__exit__()
             self._open()
-            for repeated in self._repeated.items():
-                self._writer.put(*repeated, received_ns)
+            for held in self._context.held.items():
+                self._writer.put(*held, received_ns)
         self._writer.put(key, data, received_ns)
         self.counts[key] += 1
-        if key.endswith(REPEATED):
-            self._repeated[key] = data
+        self._context.add(key, data)
 
     def _open(self) -> None:
         self._number += 1

@@ -17,9 +17,15 @@ from mcap.reader import NonSeekingReader, make_reader
 from calib.rig.recording import RecordingWriter, read_messages
 from calib.rig.recording_reader import MAGIC, RecordingReader
 from calib.rig.recording_repair import repair_recording
+from calib.rig.rig import Rig
+from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
+from camera_node.protocol.messages import encode
+from fusion.recordings.arena_recording import read_recording
 from fusion.recordings.recording_files import trim_recording
+from fusion.recordings.rotation import RotatingWriter, Rotation
 from tests.conftest import ROOT
+from tests.fusion.serving import ARENA, KEYS
 from tests.processes import run_program
 
 pytestmark = pytest.mark.computed
@@ -297,3 +303,22 @@ def test_an_empty_part_replaces_no_recording(tmp_path: Path):
         trim_recording(source, out, 100.0, 200.0, overwrite=True)
     assert read(out)[0] == entries[3:6]
     assert sorted(tmp_path.iterdir()) == [out, source]
+
+
+def test_a_rig_that_can_t_be_read_replaces_none(tmp_path: Path):
+    """Somebody sent garbage under the rig's key: a part and the next file of a rotation hold the rig before it. Both
+    held the garbage, so they could not be replayed."""
+    source, part, rotated = tmp_path / "source.mcap", tmp_path / "part.mcap", tmp_path / "next.mcap"
+    rig = RigMessage(t_ns=0, rig=Rig(cameras=ARENA.cameras))
+    seen = [encode(message) for message in ARENA.messages(1)]
+    entries = [(KEYS.rig, encode(rig), 0), (KEYS.rig, b"garbage", 1), (KEYS.detections("cam0"), seen[0], 2)]
+    with RecordingWriter(source) as writer, RotatingWriter(rotated, Rotation(max_mb=1e-6)) as files:
+        for key, data, s in entries:
+            writer.put(key, data, 10**18 + s * 10**9)
+            files.put(key, data, 10**18 + s * 10**9)
+        last = files.path
+    trim_recording(source, part, 1.5, 10.0)
+    for path in (part, last):
+        found = read_recording(path).rig
+        assert found is not None
+        assert found.cameras == ARENA.cameras
