@@ -201,7 +201,10 @@ def test_an_idea_is_three_clicks_from_its_line():
         )
 
 
-@pytest.mark.parametrize("page_path", ["CONVENTIONS.md", "DECISIONS.md", "docs/design/architecture.md"])
+@pytest.mark.parametrize(
+    "page_path",
+    ["CONVENTIONS.md", "DECISIONS.md", *(f"docs/{page}" for page in PAGES if page.startswith("design/"))],
+)
 def test_a_page_names_files_that_exist(page_path: str):
     """Files may be named without their first folders."""
     folders = ("calib", "camera_node", "examples", "fusion", "roundel", "tests", "web")
@@ -214,6 +217,9 @@ def test_a_page_names_files_that_exist(page_path: str):
     assert [name for name in sorted(named) if not any(path.endswith(f"/{name}") for path in known)] == []
     packages = set(re.findall(rf"`((?:{'|'.join(folders)})/[\w/]+)`", text))
     assert [name for name in sorted(packages) if not (ROOT / name).exists()] == []
+    modules = set(re.findall(r"`([a-z]+/[a-z_]+)`", text)) - packages if "/design/" in page_path else set()
+    stems = {path.rpartition(".")[0] for path in known}
+    assert [name for name in sorted(modules) if not any(path.endswith(f"/{name}") for path in stems)] == []
 
 
 def test_decisions_are_few_and_have_an_index():

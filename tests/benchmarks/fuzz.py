@@ -62,7 +62,7 @@ class FuzzResult:
 
     def failures(self) -> list[str]:
         """What does not hold, one line each."""
-        grown = {n: mb for n, mb in self.grown_mb.items() if mb > FILL_MB}
+        grown = {n: mb for n, mb in self.grown_mb.items() if mb > FILL_MB and n not in self.growths}
         worst = max(self.wrong, key=lambda pose: pose.error_m, default=None)
         return [
             *self.crashes,
