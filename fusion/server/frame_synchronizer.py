@@ -173,6 +173,7 @@ class FrameSynchronizer:
     def _close(self, is_due: Callable[[int], bool], silence_ns: int) -> list[FrameSet]:
         """Close all frame sets that are due. Without frames, empty sets follow for `silence_ns`: robots become lost."""
         closed = []
+        self._shorten()
         while self._end_ns is not None and self.period_ns and is_due(self._end_ns):
             oldest_ns = min((frame.t_ns for frame in self._waiting), default=None)
             if oldest_ns is None and self._end_ns > self._newest_ns + silence_ns:
@@ -185,6 +186,15 @@ class FrameSynchronizer:
                 self.period_ns = self._fastest_interval_ns()
             self._end_ns += self.period_ns
         return closed
+
+    def _shorten(self) -> None:
+        """End the open set earlier if its cameras have become faster: a second would hold all their frames of it."""
+        if self._end_ns is None or not self._is_adaptive or not self.period_ns:
+            return
+        fastest_ns = self._fastest_interval_ns()
+        if 0 < fastest_ns < PERIOD_CHANGE[0] * self.period_ns:
+            self._end_ns += fastest_ns - self.period_ns
+            self.period_ns = fastest_ns
 
     def _pop(self, end_ns: int, period_ns: int) -> FrameSet:
         frame_set = self._gather(end_ns, period_ns)

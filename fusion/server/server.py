@@ -235,8 +235,13 @@ class Server:
     # The steps of the loop.
 
     def _fuse(self, now_ns: int, is_backlogged: bool) -> None:
-        """Track the frame sets that are due; while frames of the next one are missing, associate the others."""
-        for frame_set in self._synchronize(now_ns, is_backlogged):
+        """Track the frame sets that are due; while frames of the next one are missing, associate the others.
+
+        After a pause many are due at once. Those without frames are skipped: they would cost the time in which the next
+        frames become too old.
+        """
+        due = self._synchronize(now_ns, is_backlogged)
+        for frame_set in [*(earlier for earlier in due[:-1] if earlier.frames), *due[-1:]]:
             self._track(frame_set)
         if not is_backlogged:
             self.pipeline.associate_early()

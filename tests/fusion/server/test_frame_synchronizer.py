@@ -155,6 +155,21 @@ def test_the_period_adapts_to_a_change_of_rate(factor):
     assert sum(synchronizer.late.values()) == 0
 
 
+def test_no_frame_set_holds_all_frames_of_cameras_that_became_faster():
+    """Cameras whose frames were lost for a while seem slow. Once they are faster, a set ends as soon as that is known:
+    by the median of the last eight intervals, so four of them are enough. Only those are lost that belong to the slow
+    set that their first frame completed."""
+    slow, shift = frames_of("a", 10, period=1000 * MS), 10_000 * MS
+    fast = [(ns + shift, frame(f.camera, f.t_ns - START + shift)) for ns, f in frames_of("a", 60)]
+    synchronizer = FrameSynchronizer()
+    closed = play(synchronizer, slow + fast)
+    assert max(len(frame_set.frames) for _, frame_set in closed) <= 6
+    assert (steps(closed) > 0).all()
+    lost = sorted(set(sent(slow + fast)) - set(used(closed)))
+    assert len(lost) == sum(synchronizer.late.values())
+    assert all(START + shift < t_ns < START + shift + 500 * MS for _, t_ns in lost)
+
+
 def test_a_new_sequence_starts_after_a_long_silence():
     """Between both sequences there are only as many empty sets as make robots lost."""
     pause = 3600 * 10**9

@@ -17,7 +17,7 @@ from camera_node.foundation.errors import ConfigError, NetworkError
 from camera_node.protocol.messages import ClockReply, decode, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import Limits
-from fusion.protocol.pose_messages import FusionStatus, RobotPose, RobotPoses
+from fusion.protocol.pose_messages import FusedFrames, FusionStatus, RobotPose, RobotPoses, frames_key
 from fusion.server.arena_config import in_zone, override
 from fusion.server.server import Server
 from fusion.server.transport import TOO_SLOW
@@ -153,6 +153,25 @@ def test_queued_frames_are_late_only_if_the_server_lags_far_behind(tmp_path, mon
             )
             assert any(status.faults.get(TOO_SLOW, 0) for status in statuses) == drops
             assert drops or any(pose.state == "tracked" for pose in poses)
+
+
+def test_frame_sets_without_frames_are_skipped_after_a_pause(tmp_path, monkeypatch):
+    """A server that was busy tracked each of them first; on a loaded machine the frames behind them became too old in
+    that time, and so did the next ones: robots were lost for 20 s."""
+    monkeypatch.setattr("fusion.server.server.MAX_LAG_NS", 60 * 10**9)
+    settings = msgspec.structs.replace(config(tmp_path), limits=Limits(lateness_ms=50))
+    with Server(settings) as server, connected(server) as client:
+        fused = Inbox()
+        subscriber = client.session.declare_subscriber(
+            frames_key("test"), lambda sample: fused.put(decode(sample.payload.to_bytes(), FusedFrames))
+        )
+        send_in_real_time(server, 20)
+        threading.Event().wait(1.5)
+        send_in_real_time(server, 20)
+        with running_server(server):
+            assert fused.until(lambda sets: sum(bool(s.cameras) for s in sets) > 30, DEADLINE_S)
+        subscriber.undeclare()
+    assert sum(not s.cameras for s in fused.items) <= 2
 
 
 def test_the_clock_is_answered(tmp_path):
