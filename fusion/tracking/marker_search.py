@@ -30,7 +30,7 @@ from scipy.spatial import KDTree
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
-from fusion.model.observations import Assignments, CameraArray, DetectionTable, MarkerTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, Exposures, MarkerTable
 from fusion.tracking.gating import ANY_DIAMETERS, DIAMETER_TOLERANCE
 from fusion.tracking.ray_pairs import misfit_of, pair_rays
 from fusion.tracking.rays import (
@@ -279,6 +279,14 @@ def portion_of(
     return rows[rank < limit], crowded
 
 
+def _one_of_each_camera(exposures: Exposures) -> Mask:
+    """(F,) of the frames of each camera the one nearest to the time of the frame set."""
+    order = np.lexsort((np.abs(exposures.tau), exposures.camera))
+    nearest = np.zeros(len(order), bool)
+    nearest[order[np.unique(exposures.camera[order], return_index=True)[1]]] = True
+    return nearest
+
+
 # Unassigned detections that no missing robot explains: the largest number of their pairs between different frames. Of
 # more, those around one of them are searched, each in its turn: a robot among false detections is acquired later.
 MAX_PAIRS = 80_000
@@ -313,7 +321,8 @@ class MarkerSearch:
         """Triangulate markers from unassigned detections; and the cameras that have too many of these.
 
         With part of the detections, a robot can be taken for another one whose markers are not in this part. So all are
-        searched that the markers of missing robots can explain.
+        searched that the markers of missing robots can explain. Of several frames of a camera only one is: others are
+        of other times, and the work grows with the square of the frames, most of which arrive while the server is busy.
 
         Args:
             declared: the markers of all robots.
@@ -321,7 +330,8 @@ class MarkerSearch:
             detections: of a frame set.
             assignments: of the tracked robots.
         """
-        free = np.ones(len(detections), bool)
+        used = _one_of_each_camera(detections.exposures)
+        free = used[detections.frame]
         free[assignments.detection] = False
         diameters = np.unique(2 * declared.radius) if len(declared) else np.array(ANY_DIAMETERS)
         if not free.any():
@@ -329,7 +339,7 @@ class MarkerSearch:
         self.n_frame_sets += 1
         if not (n_missing or self._has_found or self.is_due) and self.n_frame_sets % OTHERS_EVERY:
             return [], free.nonzero()[0][:0]
-        limit = n_missing + limit_of(len(detections.exposures.camera), MAX_PAIRS)
+        limit = n_missing + limit_of(int(used.sum()), MAX_PAIRS)
         portion = Portion(limit, self.n_frame_sets, float(np.median(diameters)))
         rows, crowded = portion_of(self._cameras, detections, np.flatnonzero(free), portion)
         markers = find_markers(self._cameras, detections, rows, diameters)
