@@ -89,7 +89,7 @@ def match_moved(
 
     Returns:
         T_world_cam (4, 4), and rows of expected and of detected roundels by frame. Fewer pairs than free errors leave
-        the pose as calibrated, and are those of the shift.
+        the pose as calibrated; these are the pairs by the shift, or by the last pose.
     """
     T, shift = camera.matrix(), _image_shift([view.uv for view in expected], detected)
     points = np.concatenate([view.points for view in expected], axis=1).T
