@@ -10,7 +10,7 @@ from fusion.protocol.pose_messages import FusionStatus, Robots
 
 INSTALLATION = "/recording"
 # By the ends of their keys; the first end counts.
-KINDS = {
+HELD = {
     "/rig": RigMessage,
     "/robots": Robots,
     "/fusion/status": FusionStatus,
@@ -31,7 +31,7 @@ class Context:
 
     def add(self, key: str, data: bytes) -> None:
         """Take a message, which may be of any kind."""
-        kind = next((kind for end, kind in KINDS.items() if key.endswith(end)), None)
+        kind = next((kind for end, kind in HELD.items() if key.endswith(end)), None)
         if kind is not None:
             with contextlib.suppress(MessageError):
                 decode(data, kind)

@@ -185,8 +185,8 @@ def _view(
     scene: tuple[CameraArray, MarkerTable], frame: CalibratedFrame, t_ns: int, states: States, rows: Index
 ) -> FrameView:
     (cameras, markers), tau = scene, (frame.t_ns - t_ns) * 1e-9
-    scene_at = cameras, frame.camera, states, tau, (markers, rows)
-    return FrameView(frame, ExpectedViews.of(*scene_at, frame.readout_s))
+    expected = ExpectedViews.of(cameras, frame.camera, states, tau, (markers, rows), frame.readout_s)
+    return FrameView(frame, expected)
 
 
 def _predicted(states: States, velocities: Array, dt: float) -> States:
@@ -238,16 +238,12 @@ def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tupl
     Views that show their markers where the calibration expects them need no other pose: a camera that was moved in the
     meantime has some of both kinds.
     """
-    T, matches = (
-        camera.matrix(),
-        [mutual_nearest(v.expected.uv, v.frame.roundels.uv, GATES_PX[-1]) for v in views],
-    )
-    others = [k for k, v in enumerate(views) if len(matches[k][0]) < FOUND * len(v.expected.rows)]
-    if sum(len(views[k].expected.rows) for k in others) < ERRORS:
-        return T, matches
-    T, found = match_moved(
-        camera, [views[k].expected for k in others], [views[k].frame.roundels.uv for k in others]
-    )
+    expected, detected = [view.expected for view in views], [view.frame.roundels.uv for view in views]
+    matches = [mutual_nearest(e.uv, uv, GATES_PX[-1]) for e, uv in zip(expected, detected, strict=True)]
+    others = [k for k, e in enumerate(expected) if len(matches[k][0]) < FOUND * len(e.rows)]
+    if sum(len(expected[k].rows) for k in others) < ERRORS:
+        return camera.matrix(), matches
+    T, found = match_moved(camera, [expected[k] for k in others], [detected[k] for k in others])
     for k, match in zip(others, found, strict=True):
         matches[k] = match if len(match[0]) >= len(matches[k][0]) else matches[k]
     return T, matches

@@ -164,11 +164,13 @@ class FrameSynchronizer:
         fastest_ns = next(i for i in intervals if i * FAR_FASTER >= usual_ns)
         return max(fastest_ns, round(1e9 / MAX_RATE_HZ))
 
-    def _has_rate_changed(self, period_ns: int) -> bool:
-        """Whether the rate of the cameras changed, as in dim light or on a busy machine."""
+    def _adapted_period(self, period_ns: int) -> int:
+        """The period, or another one if the rate of the cameras changed, as in dim light or on a busy machine."""
+        if not self._is_adaptive:
+            return period_ns
         low, high = PERIOD_CHANGE
         fastest_ns = self._fastest_interval_ns()
-        return fastest_ns > 0 and not low < fastest_ns / period_ns < high
+        return period_ns if fastest_ns <= 0 or low < fastest_ns / period_ns < high else fastest_ns
 
     def _close(self, is_due: Callable[[int], bool], silence_ns: int) -> list[FrameSet]:
         """Close all frame sets that are due. Without frames, empty sets follow for `silence_ns`: robots become lost."""
@@ -182,19 +184,21 @@ class FrameSynchronizer:
                 self._start()
                 continue
             closed.append(self._pop(self._end_ns, self.period_ns))
-            if self._is_adaptive and self._has_rate_changed(self.period_ns):
-                self.period_ns = self._fastest_interval_ns()
+            self.period_ns = self._adapted_period(self.period_ns)
             self._end_ns += self.period_ns
         return closed
 
     def _shorten(self) -> None:
-        """End the open set earlier if its cameras have become faster: a second would hold all their frames of it."""
-        if self._end_ns is None or not self._is_adaptive or not self.period_ns:
+        """End the open set earlier if its cameras have become faster: a long one would hold many frames of each.
+
+        The rate is computed only where more frames wait than one of each camera: this runs with every message.
+        """
+        if self._end_ns is None or not self.period_ns or len(self._waiting) <= len(self._cameras):
             return
-        fastest_ns = self._fastest_interval_ns()
-        if 0 < fastest_ns < PERIOD_CHANGE[0] * self.period_ns:
-            self._end_ns += fastest_ns - self.period_ns
-            self.period_ns = fastest_ns
+        period_ns = self._adapted_period(self.period_ns)
+        if period_ns < self.period_ns:
+            self._end_ns += period_ns - self.period_ns
+            self.period_ns = period_ns
 
     def _pop(self, end_ns: int, period_ns: int) -> FrameSet:
         frame_set = self._gather(end_ns, period_ns)

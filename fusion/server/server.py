@@ -241,8 +241,9 @@ class Server:
         frames become too old.
         """
         due = self._synchronize(now_ns, is_backlogged)
-        for frame_set in [*(earlier for earlier in due[:-1] if earlier.frames), *due[-1:]]:
-            self._track(frame_set)
+        for frame_set in due:
+            if frame_set.frames or frame_set is due[-1]:
+                self._track(frame_set)
         if not is_backlogged:
             self.pipeline.associate_early()
 

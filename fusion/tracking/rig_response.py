@@ -41,7 +41,7 @@ class RigResponse:
     """
 
     def __init__(self, estimator: Estimator) -> None:
-        self._estimator, self._cameras, n = estimator, estimator.cameras, len(estimator.single)
+        self._cameras, n = estimator.cameras, len(estimator.single)
         self.responses = np.zeros((n, 12, ERRORS * len(self._cameras.names)))
         self.counted = np.zeros((n, 12, 12))
         self._factor, self._factor_of = np.zeros((0, 0)), (-1, 0.0)

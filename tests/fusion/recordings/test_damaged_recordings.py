@@ -306,8 +306,8 @@ def test_an_empty_part_replaces_no_recording(tmp_path: Path):
 
 
 def test_a_rig_that_can_t_be_read_replaces_none(tmp_path: Path):
-    """Somebody sent garbage under the rig's key: a part and the next file of a rotation hold the rig before it. Both
-    held the garbage, so they could not be replayed."""
+    """After a message under the rig's key that is no rig, a part and the next file of a rotation begin with the rig
+    before it. Both began with that message, so they could not be replayed."""
     source, part, rotated = tmp_path / "source.mcap", tmp_path / "part.mcap", tmp_path / "next.mcap"
     rig = RigMessage(t_ns=0, rig=Rig(cameras=ARENA.cameras))
     seen = [encode(message) for message in ARENA.messages(1)]
