@@ -685,6 +685,8 @@ def next_scales(
 def _is_stationary(cost: Array) -> bool:
     """Whether the mean costs (K,) of keyframes, in order of time, are alike in both halves."""
     half = len(cost) // 2
+    if not (np.isfinite(cost[:half]).any() and np.isfinite(cost[half:]).any()):
+        return False
     before, after = np.nanmean(cost[:half]), np.nanmean(cost[half:])
     return bool(max(before, after) < CHANGED * min(before, after) or max(before, after) < USUAL)
 

@@ -67,6 +67,7 @@ class Acquisition:
     def __init__(self, cameras: CameraArray, estimator: Estimator) -> None:
         self._cameras, self._estimator = cameras, estimator
         self._turn = 0  # row of the first constellation to search for, if there are too many
+        self._usual = 0.0  # misfit of tracked robots, when there were some last
         self.search, self._weak = MarkerSearch(cameras), WeakFits()
 
     def acquire(
@@ -146,6 +147,7 @@ class Acquisition:
         """The constellations that the markers identify, and why the others are not among them."""
         if not len(missing):
             return [], {}
+        self._usual = _usual_misfit(table, detections, assignments) or self._usual
         turn = self._turn
         rows = np.roll(missing, -int(np.searchsorted(missing, turn)))[:MAX_BODIES]
         robots = {row: table.robots[row] for row in rows.tolist()}
@@ -154,7 +156,7 @@ class Acquisition:
         identified = identify(
             question,
             lambda fits: self._refine(table, Starts.of(fits, markers, table.markers), detections),
-            _usual_misfit(table, detections, assignments),
+            self._usual,
             turn,
         )
         self._turn = identified.turn
@@ -184,11 +186,15 @@ class Acquisition:
 
 
 def _usual_misfit(table: TrackTable, detections: DetectionTable, assignments: Assignments) -> float:
-    """The median of the mean squared residuals of tracked robots, in standard deviations; 0 without any."""
-    d2 = assignments.squared_px / (detections.variance_px2[assignments.detection] + SLACK_PX**2)
-    robot = table.markers.robot[assignments.marker[np.isfinite(d2)]]
-    means = mean_by_body(d2[np.isfinite(d2)], robot, len(table.robots))[np.unique(robot)]
-    return float(np.median(means)) if len(means) else 0.0
+    """The median of the mean squared residuals of tracked robots, in standard deviations, no less than the noise of
+    detections explains; 0 without any."""
+    noise = detections.variance_px2[assignments.detection]
+    d2, known = assignments.squared_px / (noise + SLACK_PX**2), np.isfinite(assignments.squared_px)
+    if not known.any():
+        return 0.0
+    robot = table.markers.robot[assignments.marker[known]]
+    means = mean_by_body(d2[known], robot, len(table.robots))[np.unique(robot)]
+    return max(float(np.median(means)), float(np.median(2 * noise / (noise + SLACK_PX**2))))
 
 
 def _without(markers: list[Marker], assignments: Assignments) -> list[Marker]:

@@ -42,6 +42,7 @@ from fusion.model.observations import (
 )
 from fusion.model.states import POSITION, VELOCITY, States
 from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.labelings import MISSED, Labeling, detection_density, find_labelings
 from fusion.tracking.rays import GATE
 
 UNASSIGNED_COST = 1e4  # of a marker without a detection: above any sum of costs within gates
@@ -51,12 +52,14 @@ MAX_JOINT = 150  # contested pairs that one assignment solves for all frames tog
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _AssignedFrames:
-    """Frames that were assigned together: for each assignment the frame, the detection in it, and the marker."""
+    """Frames that were assigned together: for each assignment the frame, the detection in it, and the marker; and the
+    other labelings of robots that are hardly less probable, with their detections in their frames."""
 
     frames: tuple[CalibratedFrame, ...]
     frame: Index
     detection: Index
     marker: Index
+    labelings: tuple[Labeling, ...]
 
     def rows(self, first: dict[int, int]) -> Index:
         """Rows of the detections in a frame set, where a frame starts at `first[id(frame)]`; negative if absent."""
@@ -124,13 +127,15 @@ class Association:
         if not new:
             return self
         detections = DetectionTable.of(FrameSet(self.t_ns, new), self.cameras)
-        detection, marker = self._assign(detections)
-        frame = detections.frame[detection]
-        part = _AssignedFrames(new, frame, detection - _first_rows(new)[frame], marker)
+        detection, marker, labelings = self._assign(detections)
+        frame, first = detections.frame[detection], _first_rows(new)
+        local = tuple(replace(one, detection=one.detection - first[one.frame]) for one in labelings)
+        part = _AssignedFrames(new, frame, detection - first[frame], marker, local)
         return replace(self, parts=(*self.parts, part))
 
-    def collect(self, frame_set: FrameSet) -> tuple[DetectionTable, Assignments]:
-        """All detections of the frame set, and its assignments in the order of the detections."""
+    def collect(self, frame_set: FrameSet) -> tuple[DetectionTable, Assignments, list[Labeling]]:
+        """All detections of the frame set, its assignments in the order of the detections, and other labelings that
+        are hardly less probable."""
         detections = DetectionTable.of(frame_set, self.cameras)
         first = dict(zip(map(id, frame_set.frames), _first_rows(frame_set.frames).tolist(), strict=True))
         marker_of = np.full(len(detections), -1)
@@ -138,18 +143,29 @@ class Association:
             rows = part.rows(first)
             marker_of[rows[rows >= 0]] = part.marker[rows >= 0]
         detection = np.flatnonzero(marker_of >= 0)
-        return detections, Assignments.of(detection, marker_of[detection])
+        number = {id(frame): k for k, frame in enumerate(frame_set.frames)}
+        labelings = [
+            replace(one, frame=number[at], detection=one.detection + first[at])
+            for part in self.parts
+            for one in part.labelings
+            if (at := id(part.frames[one.frame])) in first
+        ]
+        return detections, Assignments.of(detection, marker_of[detection]), labelings
 
-    def _assign(self, detections: DetectionTable) -> tuple[Index, Index]:
-        """Rows of the detections and of the marker table."""
+    def _assign(self, detections: DetectionTable) -> tuple[Index, Index, list[Labeling]]:
+        """Rows of the detections and of the marker table, and other labelings."""
         exposures = detections.exposures
         poses = self.cameras.frame_poses(self.states, exposures)
         focal = self.cameras.focal[exposures.camera]
         pairs, cost = self.expected.candidates(poses, detections.native, focal)
         possible = detections.may_be(pairs[1], self.marker_table.code[self.markers[pairs[0]]])
         pairs, cost = pairs[:, possible], cost[possible]
-        marker, detection = pairs[:, assign(pairs, cost, detections.frame)]
-        return detection, self.markers[marker]
+        robot = self.marker_table.robot[self.markers[pairs[0]]]
+        chosen = assign(pairs, cost, detections.frame)
+        found = find_labelings(self.cameras, detections, pairs, cost, robot, chosen)
+        labelings = [replace(one, marker=self.markers[one.marker]) for one in found]
+        marker, detection = pairs[:, chosen]
+        return detection, self.markers[marker], labelings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +242,6 @@ def _renumber(rows: Index) -> tuple[Index, int]:
 
 
 LEARNED = 8  # frames of a camera that define the usual number of detections of a robot
-MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
 # Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
 CHANGED = np.log(0.02)
 CLUTTERED = np.exp(CHANGED)  # other roundels expected in a gate: as probable there as what is judged anyway
@@ -298,7 +313,7 @@ class OwnDetections:
         others = np.delete(seen.frame, given.assignments.detection)
         if not len(others):
             return found
-        density = self._density(seen, others)
+        density = detection_density(self._cameras, seen, others)
         camera, tau = seen.exposures.camera, seen.exposures.tau
         of_p, of_both, of_v = (
             np.einsum("nii->n", states.P[:, a, b])[:, None]
@@ -328,7 +343,9 @@ class OwnDetections:
         cov, frame = observations.detections.cov, observations.detections.frame
         # The density of other roundels, of pixels instead of whitened centres.
         log_area = 0.5 * np.log(cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2)
-        other = log_area + np.log(self._density(given.detections, given.detections.frame)[frame])
+        other = log_area + np.log(
+            detection_density(self._cameras, given.detections, given.detections.frame)[frame]
+        )
         fallen, (seen, by) = np.flatnonzero(doubts.fallen), np.nonzero(doubts.views)
         of_robot, of_camera = np.concatenate([fallen, seen]), np.concatenate([np.full(len(fallen), -1), by])
         prior = np.concatenate([doubts.cost[fallen] - CHANGED, np.full(len(seen), doubts.prior)])
@@ -368,12 +385,6 @@ class OwnDetections:
         expected = [ExpectedViews.of(*scene, seen.exposures.tau[k], (self._markers, rows)) for k in frames]
         detected = [seen.uv[:, seen.frame == k].T for k in frames]
         return sum(len(shown) for shown, _ in match_moved(self._cameras[name], expected, detected, TURNED)[1])
-
-    def _density(self, detections: DetectionTable, frame: Index) -> Array:
-        """(F,) detections per pixel^2 in each frame, of those in the frames (K,)."""
-        lenses = [self._cameras[self._cameras.names[k]] for k in detections.exposures.camera.tolist()]
-        counts = np.bincount(frame, minlength=len(lenses))
-        return counts / np.array([lens.width * lens.height for lens in lenses], float)
 
     def _count(self, view: Index) -> Index:
         """(R, C) numbers of assignments."""

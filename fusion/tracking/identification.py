@@ -41,7 +41,7 @@ from fusion.tracking.constellation_search import (
     TriangulatedMarkers,
     fit,
 )
-from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2, POSITION_GATE
+from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2, MOTION_GATE, POSITION_GATE
 
 POOR = 10.0  # times the usual squared residual, above which a fit is poor
 STRONG_DETECTIONS = 8  # of three markers: they overdetermine a pose by ten
@@ -61,7 +61,8 @@ class RefinedFits:
     Attributes:
         robot: (K,) rows.
         states: with velocities.
-        chi2: (K,) of the detections, and of the position relative to the last one.
+        chi2: (K,) of the detections, of the position relative to the last one, and of the motion.
+        motion: (K,) chi-square of the velocities with six degrees of freedom, before any detection.
         misfit: (K,) mean squared residual of a detection in standard deviations.
         is_expected: (K,) fits where the robot was last, or starts.
         explained: (K,) shares of the expected views that are detected, of robots with markers on several sides; NaN
@@ -74,6 +75,7 @@ class RefinedFits:
     robot: Index
     states: States
     chi2: Array
+    motion: Array
     misfit: Array
     is_expected: Mask
     explained: Array
@@ -94,6 +96,7 @@ class RefinedFits:
             self.robot[rows],
             self.states.select(rows),
             self.chi2[rows],
+            self.motion[rows],
             self.misfit[rows],
             self.is_expected[rows],
             self.explained[rows],
@@ -169,7 +172,7 @@ def identify(question: "MissingConstellations", refine: Refine, usual: float, tu
     Args:
         question: which robots, and among which markers.
         refine: updates fits with their detections.
-        usual: mean squared residual of tracked robots in standard deviations; 0 if none is tracked.
+        usual: mean squared residual of tracked robots in standard deviations; 0 if none was tracked so far.
         turn: row of the first robot to decide about, where the limit allows only some.
     """
     robots = question.robots
@@ -195,7 +198,7 @@ class _Decisions:
 
     def __init__(self, question: MissingConstellations, usual: float, turn: int) -> None:
         size = max(question.robots, default=-1) + 1, len(question.scene)
-        self._question, self._usual = question, usual
+        self._question, self._usual, self._is_usual_known = question, usual, usual > 0
         self._accepted, self._open, self._open_good = _InUse(*size), _InUse(*size), _InUse(*size)
         self._poor: list[_ComparedFits] = []
         self.fits: list[RefinedFits] = []
@@ -211,7 +214,7 @@ class _Decisions:
         compared, decided, self.turn = _portion(mappings, self.turn)
         self._open.add(mappings.select(~compared))
         level = self._compare(mappings.select(compared), refine)
-        if level.wins.any():
+        if level.wins.any() and not self._is_usual_known:
             self._usual = max(self._usual, float(np.median(level.refined.misfit[level.wins])))
         is_good = level.refined.misfit <= POOR * self._usual
         is_free = ~self._open.touch(level.fits.mappings) & np.isin(level.refined.robot, decided)
@@ -233,7 +236,8 @@ class _Decisions:
         """Refine mappings and compare those that the detections allow."""
         fits = fit(mappings, self._question.robots, self._question.scene)
         refined = refine(fits)
-        is_plausible, is_refused = refined.misfit < MAX_CHI2, refined.explained < MIN_EXPLAINED
+        is_plausible = (refined.misfit < MAX_CHI2) & (refined.motion < MOTION_GATE)
+        is_refused = refined.explained < MIN_EXPLAINED
         self.unexplained.update(refined.robot[is_plausible & is_refused].tolist())
         is_plausible &= ~is_refused
         fits, refined = fits.select(is_plausible), refined.select(is_plausible)

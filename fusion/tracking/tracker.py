@@ -24,6 +24,7 @@ from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import AssignedFrames, AssociatedFrames, Association, OwnDetections
 from fusion.tracking.claim_check import ClaimCheck
 from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.labelings import choose_labelings
 from fusion.tracking.rays import Marker
 from fusion.tracking.result import (
     FilterStep,
@@ -166,7 +167,9 @@ class Tracker:
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
-        detections, all_assigned = associated.association.collect(self._used(frame_set))
+        detections, all_assigned, labelings = associated.association.collect(self._used(frame_set))
+        scene = self.estimator, self.table.markers, associated.prediction, detections
+        all_assigned = choose_labelings(*scene, all_assigned, labelings)
         assignments = self._update_states(associated, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)

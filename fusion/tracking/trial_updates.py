@@ -22,7 +22,7 @@ from fusion.model.observations import (
     Views,
     mean_by_body,
 )
-from fusion.model.states import States
+from fusion.model.states import OMEGA, VELOCITY, States
 from fusion.tracking.association import assign
 from fusion.tracking.constellation_search import Fits
 from fusion.tracking.estimator import Estimator
@@ -187,11 +187,14 @@ def refine(
     history = np.array(
         [table.history_chi2(k, p, np.zeros((3, 3))) for k, p in zip(rows, fit.states.p, strict=True)]
     )
+    variance = np.diagonal(starts.states.P, axis1=1, axis2=2)
+    motion = (fit.states.omega**2 / variance[:, OMEGA] + fit.states.v**2 / variance[:, VELOCITY]).sum(1)
     is_expected = (history < POSITION_GATE) & np.array([table.is_local(k) for k in rows], bool)
     return RefinedFits(
         starts.robot,
         fit.states,
-        np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2),
+        np.bincount(body, d2, n).astype(float) + np.minimum(history, FAR_CHI2) + motion,
+        motion,
         mean_by_body(d2, body, n),
         is_expected,
         explained_shares(estimator.cameras, table.markers, detections, starts.robot, fit.states),

@@ -70,6 +70,7 @@ class SceneCamera(Source):
         self.dropped, self.fault = 0, CameraFault()
         self._shown = no_roundels()  # by the last frame
         self._held: list[tuple[Frame, Roundels]] = []  # of frames that arrive in the wrong order
+        self._burst = False, 0  # whether frames arrive, and until when, ns
         self._world, self._scene, self._detector = world, Scene(world.load), detector
         self._name, self._index = name, self._scene.cameras.names.index(name)
         self._phase = world.load.phases()[self._index]
@@ -101,13 +102,24 @@ class SceneCamera(Source):
     def deliver(self, seq: int) -> list[tuple[Frame, Roundels]]:
         """The frames that become available with this one: none, one, or two."""
         fault = self.fault
-        if fault.silent or self._rng.random() < fault.loss:
+        if fault.silent or self._rng.random() < fault.loss or self._is_between_bursts(seq):
             return []
         self._held += [self._expose(self._time_ns(seq), fault)] * (2 if fault.doubled else 1)
         if fault.swapped and len(self._held) < 2:
             return []
         delivered, self._held = self._held[::-1], []
         return delivered
+
+    def _is_between_bursts(self, seq: int) -> bool:
+        means_s, t_ns, (arrives, until_ns) = self.fault.bursts_s, self._time_ns(seq), self._burst
+        if means_s is None:
+            return False
+        while until_ns < t_ns:
+            arrives = not arrives
+            until_ns = max(until_ns, self.fault.since_ns)
+            until_ns += round(self._rng.exponential(means_s[0 if arrives else 1]) * 1e9)
+        self._burst = arrives, until_ns
+        return not arrives
 
     def place(self, fault: CameraFault) -> None:
         """Set the faults, and the true pose and focal length of the camera."""

@@ -55,6 +55,8 @@ class CameraFault(msgspec.Struct, frozen=True, kw_only=True):
         picture: what its images show.
         false: roundels that are not there, in each frame.
         loss: share of frames that are lost.
+        bursts_s: mean times during which its frames arrive, and during which they are lost, as from a machine that has
+            too much to do; both are distributed exponentially.
         delay_ms: of every frame.
         swapped: each two frames arrive in the wrong order.
         doubled: every frame arrives twice.
@@ -68,6 +70,7 @@ class CameraFault(msgspec.Struct, frozen=True, kw_only=True):
     picture: str = "live"  # or frozen, black, bright
     false: int = 0
     loss: float = 0.0
+    bursts_s: tuple[float, float] | None = None
     delay_ms: float = 0.0
     swapped: bool = False
     doubled: bool = False
