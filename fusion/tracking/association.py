@@ -27,7 +27,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
@@ -41,13 +40,12 @@ from fusion.model.observations import (
     MatchedObservations,
 )
 from fusion.model.states import POSITION, VELOCITY, States
+from fusion.tracking.assignment import assign
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.labelings import MISSED, Labeling, detection_density, find_labelings
 from fusion.tracking.rays import GATE
 
-UNASSIGNED_COST = 1e4  # of a marker without a detection: above any sum of costs within gates
 MAX_DETECTIONS = 1 << 32  # above the number of detections in any frame set
-MAX_JOINT = 150  # contested pairs that one assignment solves for all frames together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,42 +201,6 @@ class AssignedFrames:
 def _first_rows(frames: Sequence[CalibratedFrame]) -> Index:
     """The row of each frame's first detection in a detection table."""
     return np.cumsum([0, *(len(frame.roundels) for frame in frames)])[:-1]
-
-
-def assign(pairs: Index, cost: Array, frame: Index) -> Index:
-    """Choose as many pairs as possible in each frame at the lowest total cost.
-
-    Args:
-        pairs: (2, K) rows of markers and detections.
-        cost: (K,), each below `UNASSIGNED_COST`.
-        frame: (N,) of the detections.
-
-    Returns:
-        the chosen columns of `pairs`; pairs without a rival are chosen directly.
-    """
-    marker, detection = pairs
-    view = frame[detection] * (np.max(marker, initial=0) + 1) + marker  # of a marker in a frame
-    rivals = np.maximum(np.bincount(view)[view], np.bincount(detection)[detection])
-    alone, contested = np.flatnonzero(rivals == 1), np.flatnonzero(rivals > 1)
-    at = frame[detection[contested]]
-    groups = [contested] if len(contested) < MAX_JOINT else [contested[at == k] for k in set(at.tolist())]
-    chosen = [rows[_solve_assignment(view[rows], detection[rows], cost[rows])] for rows in groups]
-    return np.concatenate([alone, *chosen])
-
-
-def _solve_assignment(view: Index, detection: Index, cost: Array) -> Index:
-    i, n = _renumber(view)
-    j, m = _renumber(detection)
-    costs, number = np.full((n, m), UNASSIGNED_COST), np.full((n, m), -1)
-    costs[i, j], number[i, j] = cost, np.arange(len(cost))
-    chosen = number[linear_sum_assignment(costs)]
-    return chosen[chosen >= 0]
-
-
-def _renumber(rows: Index) -> tuple[Index, int]:
-    """Rows renumbered from 0 without gaps, and their count."""
-    new = np.cumsum(np.bincount(rows) > 0)
-    return new[rows] - 1, int(new[-1]) if len(new) else 0
 
 
 LEARNED = 8  # frames of a camera that define the usual number of detections of a robot

@@ -8,6 +8,9 @@ of all detections of the robot and its prediction, each after an update of its o
 Tardos 2001). Only pairs are used that all labelings have whose probability is not far below that of the best. Where
 the model explains none, as with errors of cameras that the rig does not state, or a robot that was carried, it can't
 compare them, and the detections stay as they were assigned.
+
+Where a rotation is not known to half a radian, detections of one camera alone are not used: nothing would show that
+they are labeled wrongly.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,12 +28,15 @@ from fusion.model.observations import (
     MarkerTable,
     MatchedObservations,
 )
+from fusion.model.states import THETA
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.rays import GATE
 
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
 MAX_CHOICES, MAX_STEPS = 64, 5_000  # labelings of one view, and steps of their search
 IMPOSSIBLE = 1e-5  # probability of the costs of a right labeling above which it contradicts the model
+# Rotation sigma above which detections of a single camera say nothing of a body: its equations are not linear that far.
+UNKNOWN_RAD = 0.5
 ROUNDS = 3  # in which better labelings replace those before
 MAX_LABELINGS = 200  # compared in one frame set, the most doubtful ones: 30 ms of a core
 
@@ -97,9 +103,12 @@ def choose_labelings(
         assignments: of the frame set.
         labelings: others that may be right.
     """
-    if not labelings:
+    assignments = _without_unchecked(estimator, markers, prediction, detections, assignments)
+    robots = set(markers.robot[assignments.marker].tolist())
+    others = [labeling for labeling in labelings if labeling.robot in robots]
+    if not others:
         return assignments
-    others = sorted(labelings, key=lambda labeling: labeling.margin)[:MAX_LABELINGS]
+    others = sorted(others, key=lambda labeling: labeling.margin)[:MAX_LABELINGS]
     margins_of = partial(_margins, estimator, markers, prediction, detections)
     margins = margins_of(assignments, others)
     for _ in range(ROUNDS):
@@ -117,6 +126,26 @@ def choose_labelings(
         shared = (pairs[:, None] == np.column_stack([other.marker, other.detection])).all(2).any(1)
         undecided[row[~shared]] = True
     return assignments.select(~undecided)
+
+
+def _without_unchecked(
+    estimator: Estimator,
+    markers: MarkerTable,
+    prediction: Prediction,
+    detections: DetectionTable,
+    assignments: Assignments,
+) -> Assignments:
+    """Without those of robots without codes whose rotation is unknown and that one camera alone sees."""
+    P, n = prediction.states.P, len(prediction.states)
+    is_coded = np.bincount(markers.robot, markers.code > 0, n) > 0
+    unknown = (np.einsum("nii->n", P[:, THETA, THETA]) > 3 * UNKNOWN_RAD**2) & ~estimator.single & ~is_coded
+    if not unknown.any():
+        return assignments
+    robot = markers.robot[assignments.marker]
+    camera = detections.exposures.camera[detections.frame[assignments.detection]]
+    seen = np.zeros((len(unknown), len(estimator.cameras.names)), bool)
+    seen[robot, camera] = True
+    return assignments.select(~(unknown & (seen.sum(1) == 1))[robot])
 
 
 def _margins(

@@ -23,7 +23,7 @@ from fusion.model.observations import (
     mean_by_body,
 )
 from fusion.model.states import OMEGA, VELOCITY, States
-from fusion.tracking.association import assign
+from fusion.tracking.assignment import assign
 from fusion.tracking.constellation_search import Fits
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (

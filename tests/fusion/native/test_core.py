@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
 from fusion.model.states import States, predict
-from fusion.tracking.association import assign
+from fusion.tracking.assignment import assign
 from tests.fusion import equations
 from tests.fusion.native.scene import ARRAY, BODIES, scene
 
