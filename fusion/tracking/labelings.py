@@ -13,14 +13,14 @@ Where a rotation is not known to half a radian, detections of one camera alone a
 they are labeled wrongly.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from scipy.stats import chi2
 
-from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.observations import (
     Assignments,
     CameraArray,
@@ -33,12 +33,15 @@ from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.rays import GATE
 
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
+MAX_VIEWS = (
+    64  # searched in one association: 10 ms of a core; of more, as after a start of many robots, some stay
+)
 MAX_CHOICES, MAX_STEPS = 64, 5_000  # labelings of one view, and steps of their search
 IMPOSSIBLE = 1e-5  # probability of the costs of a right labeling above which it contradicts the model
 # Rotation sigma above which detections of a single camera say nothing of a body: its equations are not linear that far.
 UNKNOWN_RAD = 0.5
 ROUNDS = 3  # in which better labelings replace those before
-MAX_LABELINGS = 200  # compared in one frame set, the most doubtful ones: 30 ms of a core
+MAX_LABELINGS = 100  # compared in one frame set, the most doubtful ones: 10 ms of a core
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +72,8 @@ def find_labelings(
 ) -> list[Labeling]:
     """The other labelings of frames that are hardly less probable, each marker by itself.
 
+    The numbers of views and of labelings are bounded; what is above the bounds stays as it was assigned.
+
     Args:
         cameras: cameras of the rig.
         detections: of the frames.
@@ -77,12 +82,29 @@ def find_labelings(
         robot: (K,) of the pairs.
         chosen: columns of `pairs`.
     """
-    frame = detections.frame[pairs[1]]
-    views = _vague_views(pairs, frame, robot, chosen)
-    if not views:
+    frame, n = detections.frame[pairs[1]], np.max(robot, initial=0) + 1
+    of_detection = pairs[1] * n + robot
+    shared = np.bincount(of_detection)[of_detection] > 1
+    if not shared.any():
         return []
     cost = cost + 3 * np.log(2 * np.pi) - unpaired_cost(cameras, detections)[frame]
-    return [one for view in views for one in _other_labelings(pairs, cost, frame, robot, chosen, *view)]
+    view = frame * n + robot
+    owner = np.full(len(detections), -1)
+    owner[pairs[1, chosen]] = chosen
+    vague = _vague_views(pairs, cost, frame * (np.max(pairs[0]) + 1) + pairs[0], owner, view, shared)
+    of = owner[pairs[1]]
+    free = np.flatnonzero((of < 0) | (view[of] == view))  # pairs of detections that no other robot has
+    free = free[np.argsort(view[free], kind="stable")]
+    found = list[Labeling]()
+    for at in vague[:: max(1, -(-len(vague) // MAX_VIEWS))].tolist():
+        rows = free[slice(*np.searchsorted(view[free], [at, at + 1]))]
+        own = np.flatnonzero(of[rows] == rows)
+        present = float(cost[rows[own]].sum())
+        for choice, total in _choices(pairs[:, rows], cost[rows], len(own) - 1, present + GATE):
+            if choice != own.tolist():
+                detection, marker = pairs[1, rows[choice]], pairs[0, rows[choice]]
+                found.append(Labeling(at % n, at // n, detection, marker, total - present))
+    return found
 
 
 def choose_labelings(
@@ -117,7 +139,9 @@ def choose_labelings(
             break
         for k in better:
             assignments, others[k] = _exchange(markers, detections, assignments, others[k])
-        margins = margins_of(assignments, others)
+        changed = {others[k].robot for k in better}
+        rows = [k for k, other in enumerate(others) if other.robot in changed]
+        margins[rows] = margins_of(assignments, [others[k] for k in rows])
     robot, frame = markers.robot[assignments.marker], detections.frame[assignments.detection]
     undecided = np.zeros(len(robot), bool)
     for k in np.flatnonzero(margins < GATE).tolist():
@@ -219,43 +243,29 @@ def _exchange(
     return joined.select(np.argsort(joined.detection, kind="stable")), before
 
 
-def _vague_views(pairs: Index, frame: Index, robot: Index, chosen: Index) -> list[tuple[int, int]]:
-    """The robots and frames whose chosen pairs may be wrong, since predictions do not tell markers apart: a detection
-    is in the gates of two markers of one robot.
+def _vague_views(
+    pairs: Index, cost: Array, of_marker: Index, owner: Index, view: Index, shared: Mask
+) -> Index:
+    """The views whose chosen pairs may be wrong, since predictions do not tell markers apart: a detection is in the
+    gates of two markers of one robot, and it could be exchanged at little cost.
 
     Args:
-        pairs, robot, chosen: see `find_labelings`.
-        frame: (K,) of the pairs.
-    """
-    n = np.max(robot, initial=0) + 1
-    of_detection = pairs[1] * n + robot
-    shared = np.bincount(of_detection)[of_detection] > 1
-    if not shared.any():
-        return []
-    view = frame * n + robot
-    at, who = np.divmod(np.intersect1d(view[shared], view[chosen]), n)
-    return list(zip(who.tolist(), at.tolist(), strict=True))
-
-
-def _other_labelings(
-    pairs: Index, cost: Array, frame: Index, robot: Index, chosen: Index, of_robot: int, of_frame: int
-) -> Iterator[Labeling]:
-    """The other labelings of a view with as many pairs, or one less, that are hardly less probable.
-
-    Args:
-        pairs, robot, chosen: see `find_labelings`.
+        pairs: see `find_labelings`.
         cost: (K,) of the pairs less that of no pair.
-        frame: (K,) of the pairs.
-        of_robot, of_frame: the view.
+        of_marker, view: (K,) numbers of the marker, or of the robot, in the frame.
+        owner: (N,) the chosen pair of each detection, -1 for none.
+        shared: (K,) pairs whose detections are in the gates of two markers of one robot.
     """
-    in_view = (robot == of_robot) & (frame == of_frame)
-    own = np.sort(chosen[in_view[chosen]])
-    free = np.flatnonzero(in_view & ~np.isin(pairs[1], pairs[1, chosen[~in_view[chosen]]]))
-    present = float(cost[own].sum())
-    for rows, total in _choices(pairs[:, free], cost[free], len(own) - 1, present + GATE):
-        other = free[rows]
-        if not np.array_equal(other, own):
-            yield Labeling(of_robot, of_frame, pairs[1, other], pairs[0, other], total - present)
+    of, chosen = owner[pairs[1]], owner[owner >= 0]
+    is_chosen = of == np.arange(len(cost))
+    present, other = np.zeros(np.max(of_marker) + 1), np.zeros(np.max(of_marker) + 1)
+    present[of_marker[chosen]] = cost[chosen]
+    np.minimum.at(
+        other, of_marker[~is_chosen], cost[~is_chosen]
+    )  # the least that a marker costs without its pair
+    loss = np.where(of >= 0, other[of_marker[of]] - cost[of], 0.0)  # of the marker whose detection it is now
+    possible = shared & ~is_chosen & (cost - present[of_marker] + loss < GATE)
+    return np.intersect1d(view[possible], view[chosen])
 
 
 def _choices(pairs: Index, cost: Array, least: int, limit: float) -> list[tuple[list[int], float]]:
