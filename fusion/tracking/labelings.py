@@ -33,9 +33,8 @@ from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.rays import GATE
 
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
-MAX_VIEWS = (
-    64  # searched in one association: 10 ms of a core; of more, as after a start of many robots, some stay
-)
+# Views searched in one association: 10 ms of a core. Of more, as after a start of many robots, some stay as assigned.
+MAX_VIEWS = 64
 MAX_CHOICES, MAX_STEPS = 64, 5_000  # labelings of one view, and steps of their search
 IMPOSSIBLE = 1e-5  # probability of the costs of a right labeling above which it contradicts the model
 # Rotation sigma above which detections of a single camera say nothing of a body: its equations are not linear that far.
@@ -260,9 +259,8 @@ def _vague_views(
     is_chosen = of == np.arange(len(cost))
     present, other = np.zeros(np.max(of_marker) + 1), np.zeros(np.max(of_marker) + 1)
     present[of_marker[chosen]] = cost[chosen]
-    np.minimum.at(
-        other, of_marker[~is_chosen], cost[~is_chosen]
-    )  # the least that a marker costs without its pair
+    # The least that a marker costs without its pair.
+    np.minimum.at(other, of_marker[~is_chosen], cost[~is_chosen])
     loss = np.where(of >= 0, other[of_marker[of]] - cost[of], 0.0)  # of the marker whose detection it is now
     possible = shared & ~is_chosen & (cost - present[of_marker] + loss < GATE)
     return np.intersect1d(view[possible], view[chosen])
