@@ -455,6 +455,10 @@ class MatchedObservations(Columns):
         """Detections of known discs, row by row, each captured when the detection was."""
         return cls(replace(discs, delay=detections.delay), detections, _whiten(detections))
 
+    def with_bodies(self, body: Index) -> "MatchedObservations":
+        """The same of other bodies (N,), as of several states of one robot."""
+        return replace(self, discs=replace(self.discs, body=body))
+
     def misfit(self, squared_px: Array) -> Array:
         """(N,) squared residuals (N,), px^2, in standard deviations, including `SLACK_PX`; infinite where these are
         NaN: the disc is not visible."""
@@ -469,6 +473,13 @@ def _whiten(detections: DetectionTable) -> Array:
     c = np.sqrt(detections.cov[1, 1] - b * b)
     first = detections.scale[0] / a
     return np.stack([first, (detections.scale[1] - b * first) / c])
+
+
+def detection_density(cameras: CameraArray, detections: DetectionTable, frame: Index) -> Array:
+    """(F,) detections per pixel^2 in each frame, of those in the frames (K,)."""
+    lenses = [cameras[cameras.names[k]] for k in detections.exposures.camera.tolist()]
+    counts = np.bincount(frame, minlength=len(lenses))
+    return counts / np.array([lens.width * lens.height for lens in lenses], float)
 
 
 def mean_by_body(values: NDArray, body: Index, n_bodies: int) -> Array:

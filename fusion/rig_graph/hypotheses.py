@@ -110,7 +110,6 @@ class Window:
         row[bodies] = np.arange(len(bodies))
         kept = np.flatnonzero(row[self.observations.discs.body] >= 0)
         seen = self.observations.select(kept)
-        discs = replace(seen.discs, body=row[seen.discs.body])
         return replace(
             self,
             states=self.states.select(bodies),
@@ -118,7 +117,7 @@ class Window:
             moving=self.moving[bodies],
             single=self.single[bodies],
             robot=self.robot[bodies],
-            observations=replace(seen, discs=discs),
+            observations=seen.with_bodies(row[seen.discs.body]),
             by_focal=np.ascontiguousarray(self.by_focal[:, kept]),
             keyframe=self.keyframe[bodies],
         )

@@ -38,11 +38,12 @@ from fusion.model.observations import (
     DetectionTable,
     MarkerTable,
     MatchedObservations,
+    detection_density,
 )
 from fusion.model.states import POSITION, VELOCITY, States
 from fusion.tracking.assignment import assign
 from fusion.tracking.estimator import Estimator, Prediction
-from fusion.tracking.labelings import MISSED, Labeling, detection_density, find_labelings
+from fusion.tracking.labelings import MISSED, Labeling, find_labelings
 from fusion.tracking.rays import GATE
 
 MAX_DETECTIONS = 1 << 32  # above the number of detections in any frame set
@@ -160,10 +161,10 @@ class Association:
         pairs, cost = pairs[:, possible], cost[possible]
         robot = self.marker_table.robot[self.markers[pairs[0]]]
         chosen = assign(pairs, cost, detections.frame)
-        found = find_labelings(self.cameras, detections, pairs, cost, robot, chosen)
-        labelings = [replace(one, marker=self.markers[one.marker]) for one in found]
-        marker, detection = pairs[:, chosen]
-        return detection, self.markers[marker], labelings
+        rows = np.stack([self.markers[pairs[0]], pairs[1]])
+        labelings = find_labelings(self.cameras, detections, rows, cost, robot, chosen)
+        marker, detection = rows[:, chosen]
+        return detection, marker, labelings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,20 +27,20 @@ from fusion.model.observations import (
     DetectionTable,
     MarkerTable,
     MatchedObservations,
+    detection_density,
 )
-from fusion.model.states import THETA
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.rays import GATE
 
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
-# Views searched in one association: 10 ms of a core. Of more, as after a start of many robots, some stay as assigned.
-MAX_VIEWS = 64
+# Bounds of the time of a frame set: 64 views were searched in 20 ms of a core, 100 labelings compared in 15. Of more,
+# as after a start of many robots, the others stay as assigned.
+MAX_VIEWS, MAX_LABELINGS = 64, 100  # the labelings are the most doubtful ones
 MAX_CHOICES, MAX_STEPS = 64, 5_000  # labelings of one view, and steps of their search
-IMPOSSIBLE = 1e-5  # probability of the costs of a right labeling above which it contradicts the model
-# Rotation sigma above which detections of a single camera say nothing of a body: its equations are not linear that far.
-UNKNOWN_RAD = 0.5
+# Probability of the cost of a labeling below which it contradicts the model. A robot carried by 0.3 m had 5e-7;
+# with 1e-3 some right labelings of sparse frame sets were not compared.
+IMPOSSIBLE = 1e-5
 ROUNDS = 3  # in which better labelings replace those before
-MAX_LABELINGS = 100  # compared in one frame set, the most doubtful ones: 10 ms of a core
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ def find_labelings(
     Args:
         cameras: cameras of the rig.
         detections: of the frames.
-        pairs: (2, K) rows of markers and detections, by ascending first row.
+        pairs: (2, K) rows of the marker table and of detections, by ascending marker.
         cost: (K,) of the pairs, twice their negative log-likelihoods per pixel^2 without the factors of pi.
         robot: (K,) of the pairs.
         chosen: columns of `pairs`.
@@ -110,6 +110,7 @@ def choose_labelings(
     estimator: Estimator,
     markers: MarkerTable,
     prediction: Prediction,
+    unknown: Mask,
     detections: DetectionTable,
     assignments: Assignments,
     labelings: Sequence[Labeling],
@@ -120,11 +121,12 @@ def choose_labelings(
         estimator: of all robots.
         markers: of all robots.
         prediction: of all robots.
+        unknown: (R,) robots that one camera alone does not locate; see `TrackTable.is_rotation_unknown`.
         detections: of a frame set.
         assignments: of the frame set.
         labelings: others that may be right.
     """
-    assignments = _without_unchecked(estimator, markers, prediction, detections, assignments)
+    assignments = _without_unchecked(markers, detections, assignments, unknown)
     robots = set(markers.robot[assignments.marker].tolist())
     others = [labeling for labeling in labelings if labeling.robot in robots]
     if not others:
@@ -152,21 +154,13 @@ def choose_labelings(
 
 
 def _without_unchecked(
-    estimator: Estimator,
-    markers: MarkerTable,
-    prediction: Prediction,
-    detections: DetectionTable,
-    assignments: Assignments,
+    markers: MarkerTable, detections: DetectionTable, assignments: Assignments, unknown: Mask
 ) -> Assignments:
-    """Without those of robots without codes whose rotation is unknown and that one camera alone sees."""
-    P, n = prediction.states.P, len(prediction.states)
-    is_coded = np.bincount(markers.robot, markers.code > 0, n) > 0
-    unknown = (np.einsum("nii->n", P[:, THETA, THETA]) > 3 * UNKNOWN_RAD**2) & ~estimator.single & ~is_coded
+    """Without those of robots of unknown rotation that one camera alone sees."""
     if not unknown.any():
         return assignments
-    robot = markers.robot[assignments.marker]
-    camera = detections.exposures.camera[detections.frame[assignments.detection]]
-    seen = np.zeros((len(unknown), len(estimator.cameras.names)), bool)
+    robot, camera = markers.robot[assignments.marker], detections.camera[assignments.detection]
+    seen = np.zeros((len(unknown), np.max(camera, initial=0) + 1), bool)
     seen[robot, camera] = True
     return assignments.select(~(unknown & (seen.sum(1) == 1))[robot])
 
@@ -186,8 +180,7 @@ def _margins(
     robots = np.unique(of_other)
     bodies = np.concatenate([robots, of_other])
     body, tried = _tried(markers, detections, assignments, robots, others)
-    observations = MatchedObservations.of(tried, detections, markers)
-    observations = replace(observations, discs=replace(observations.discs, body=body))
+    observations = MatchedObservations.of(tried, detections, markers).with_bodies(body)
     estimator, states = estimator.select(bodies), prediction.states.select(bodies)
     prepared = estimator.prepared(states, observations)
     fit = estimator.fit(Prediction(states, prediction.information[bodies], prediction.motion), prepared)
@@ -211,10 +204,10 @@ def _tried(
     number of the robot or labeling of each."""
     robot, frame = markers.robot[assignments.marker], detections.frame[assignments.detection]
     own = {k: np.flatnonzero(robot == k) for k in robots.tolist()}
-    kept = {(one.robot, one.frame): own[one.robot][frame[own[one.robot]] != one.frame] for one in others}
+    rest = {(one.robot, one.frame): own[one.robot][frame[own[one.robot]] != one.frame] for one in others}
     none = np.empty(0, np.intp)
     parts = [(rows, none, none) for rows in own.values()]
-    parts += [(kept[one.robot, one.frame], one.detection, one.marker) for one in others]
+    parts += [(rest[one.robot, one.frame], one.detection, one.marker) for one in others]
     detection = [part for rows, added, _ in parts for part in (assignments.detection[rows], added)]
     marker = [part for rows, _, added in parts for part in (assignments.marker[rows], added)]
     body = np.repeat(np.arange(len(parts)), [len(rows) + len(added) for rows, added, _ in parts])
@@ -298,13 +291,6 @@ def _choices(pairs: Index, cost: Array, least: int, limit: float) -> list[tuple[
         if not rows or (marker[rows[-1]] != marker[k] and detection[k] not in [detection[i] for i in rows]):
             open_.append((k + 1, [*rows, k], total + costs[k]))
     return found
-
-
-def detection_density(cameras: CameraArray, detections: DetectionTable, frame: Index) -> Array:
-    """(F,) detections per pixel^2 in each frame, of those in the frames (K,)."""
-    lenses = [cameras[cameras.names[k]] for k in detections.exposures.camera.tolist()]
-    counts = np.bincount(frame, minlength=len(lenses))
-    return counts / np.array([lens.width * lens.height for lens in lenses], float)
 
 
 def unpaired_cost(cameras: CameraArray, detections: DetectionTable) -> Array:

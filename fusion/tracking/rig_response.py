@@ -15,7 +15,6 @@ of the cameras. It is exact for any gain, so also for robust weights. docs/desig
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -69,8 +68,7 @@ class RigResponse:
             fits: of the robots.
         """
         self.forget(fits.robot)
-        discs = replace(fits.observations.discs, body=fits.robot[fits.body])
-        observations, n = replace(fits.observations, discs=discs), len(states)
+        observations, n = fits.observations.with_bodies(fits.robot[fits.body]), len(states)
         at_rest = Transition(np.zeros((n, 3, 3)), np.zeros(n))
         unknown = np.zeros((n, 12, 12)), at_rest
         self._follow(states, observations, (fits.equations, fits.weights), unknown, 0.0)

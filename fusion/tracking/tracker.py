@@ -168,7 +168,8 @@ class Tracker:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
         detections, all_assigned, labelings = associated.association.collect(self._used(frame_set))
-        scene = self.estimator, self.table.markers, associated.prediction, detections
+        unknown = self.table.is_rotation_unknown(associated.prediction.states)
+        scene = self.estimator, self.table.markers, associated.prediction, unknown, detections
         all_assigned = choose_labelings(*scene, all_assigned, labelings)
         assignments = self._update_states(associated, detections, all_assigned)
         self.table.observe(t_ns, assignments)

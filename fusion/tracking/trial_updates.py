@@ -176,8 +176,7 @@ def refine(
         detections: of the frame set.
     """
     n, body = len(starts.robot), starts.body
-    observations = MatchedObservations.of(starts.assignments, detections, table.markers)
-    observations = replace(observations, discs=replace(observations.discs, body=body))
+    observations = MatchedObservations.of(starts.assignments, detections, table.markers).with_bodies(body)
     estimator = estimator.select(starts.robot)
     prediction = estimator.predict(starts.states, np.full(n, START_S))
     prepared = estimator.prepared(prediction.states, observations)

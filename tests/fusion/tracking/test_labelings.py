@@ -10,12 +10,16 @@ import pytest
 from fusion.model.frames import FrameSet
 from fusion.model.observations import Assignments, DetectionTable
 from fusion.model.states import States
+from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.tracking import identification
 from fusion.tracking.gating import MOTION_GATE, START_SIGMAS
 from fusion.tracking.tracker import Tracker
 from fusion.tracking.trial_updates import Starts, refine
 from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.faults.world import CameraFault, World
 from tests.benchmarks.fusion_load import START_NS, Load
+from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, line
+from tests.fusion.tracks import poses_of, track
 
 pytestmark = pytest.mark.computed
 
@@ -57,6 +61,35 @@ def test_frames_that_arrive_in_bursts_make_no_pose_wrong(
         arena.wait(seconds)
         assert arena.judge.count > 40 * seconds
         assert arena.judge.wrong == []
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_of_an_unknown_rotation_one_camera_alone_says_nothing(cameras: int):
+    """After 0.27 s without frames a rotation is known to a radian (one sigma)."""
+    arena = Arena({"a": TRIANGLE}, {"a": line((0.0, 0.0, 0.2))}, sigma_px=0.1)
+    tracker, synchronizer = Tracker(arena.cameras, arena.robots), FrameSynchronizer(PERIOD_NS)
+    for frame in arena.frames(20):
+        synchronizer.add(frame)
+    sets = synchronizer.finish()
+    for frame_set in sets[:-8]:
+        tracker.track(frame_set)
+    seen = [frame for frame in sets[-1].frames if frame.camera in ("cam0", "cam1")[:cameras]]
+    assert len(seen) == cameras
+    predicted = tracker.predict(sets[-1].t_ns)
+    assert predicted.tracked.all()
+    assert tracker.table.is_rotation_unknown(predicted.prediction.states).all()
+    last = FrameSet(sets[-1].t_ns, tuple(seen))
+    update = tracker.update(tracker.associate(predicted, last), last)
+    assert (len(update.assignments) > 0) == (cameras > 1)
+
+
+def test_a_robot_is_not_acquired_by_an_improbable_motion(monkeypatch: pytest.MonkeyPatch):
+    """At 3 m/s it is, until the gate lies below its chi-square of 4."""
+    arena = Arena({"a": TRIANGLE}, {"a": line((-1.2, 0.0, 0.2), (3.0, 0, 0))}, sigma_px=0.1)
+    frames = arena.frames(15)
+    assert "tracked" in {pose.state for pose in poses_of(track(arena, frames), "a")}
+    monkeypatch.setattr(identification, "MOTION_GATE", 1.0)
+    assert "tracked" not in {pose.state for pose in poses_of(track(arena, frames), "a")}
 
 
 @pytest.mark.parametrize(("speed_m_s", "is_probable"), [(3.0, True), (15.0, False)])
