@@ -130,6 +130,25 @@ class ExpectedMarkers:
         focal (F,) pixels, by frame.
         """
 
+def labelings(
+    first: Index,
+    marker: Index,
+    detection: Index,
+    cost: Array,
+    least: Index,
+    most: Array,
+    max_steps: int,
+    max_labelings: int,
+    /,
+) -> tuple[Index, Array, Index, Index]:
+    """Choices of pairs without a common marker or detection: their views and costs (L,), and of each pair that they
+    have the choice and the pair (R,).
+
+    Pairs (K,) of markers and detections with costs, by view and ascending marker; those of view v start at `first[v]`
+    of (V + 1,). A choice has `least` (V,) pairs or more that cost less than `most` (V,) together. The search ends after
+    `max_steps`, or `max_labelings`, of a view.
+    """
+
 class Viewpoints:
     """The cameras of F frames."""
 

@@ -6,6 +6,7 @@ frame; the other parts are added in the world frame. White noise on acceleration
 2001, section 6.2.2); see docs/design/fusion_filter.md.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +66,21 @@ class States(Columns):
             self.v + delta[:, VELOCITY],
             self.P,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSetFit:
+    """How robots fit the detections of a frame set.
+
+    Attributes:
+        is_doubtful: whether most robots contradict their predictions.
+        usual_cost: of an equation of the median robot in the last frame sets: 1 if all claims hold.
+        displaced: cameras that show most markers elsewhere, and in how many frame sets in a row.
+    """
+
+    is_doubtful: bool
+    usual_cost: float
+    displaced: Mapping[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

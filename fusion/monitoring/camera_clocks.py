@@ -11,6 +11,7 @@ See docs/design/time_offsets.md.
 
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import median_high, median_low
 from typing import Literal
@@ -45,6 +46,7 @@ class _Clock:
         check: of its stamps.
         correction_s, sigma_s: added to its stamps at `since_ns`, and the standard deviation.
         rate, rate_sigma: by which that grows, and the standard deviation.
+        doubt_s: an offset that robots may show.
         since_ns, now_ns: the time of the last estimate, and of the last frame.
         reported_s: the correction that was last reported.
     """
@@ -54,6 +56,7 @@ class _Clock:
     sigma_s: float = 0.0
     rate: float = 0.0
     rate_sigma: float = 0.0
+    doubt_s: float = 0.0
     since_ns: int = 0
     now_ns: int = 0
     reported_s: float = 0.0
@@ -65,7 +68,8 @@ class _Clock:
     @property
     def known_s(self) -> float:
         """Standard deviation of the correction of the last frame: the rate is not known exactly."""
-        return math.hypot(self.sigma_s, self.rate_sigma * (self.now_ns - self.since_ns) * 1e-9)
+        grown_s = self.rate_sigma * (self.now_ns - self.since_ns) * 1e-9
+        return math.hypot(self.sigma_s, grown_s, self.doubt_s)
 
     @property
     def is_off(self) -> bool:
@@ -115,13 +119,12 @@ class CameraClocks:
         if jump is None:
             return self._refute(frame)
         # The clock was set, or is another one: its rate may have ended.
-        sigma_s, rate_sigma = 1e-9 * jump.sigma_ns, abs(clock.rate)
-        clock.rate_sigma = math.hypot(clock.rate_sigma, rate_sigma)
-        if not jump.ahead_ns:
-            clock.sigma_s = math.hypot(clock.sigma_s, sigma_s)
-            return sigma_s, rate_sigma
+        sigma_s, rate_sigma = 1e-9 * jump.sigma_ns, math.hypot(clock.rate, clock.rate_sigma)
+        clock.sigma_s, clock.rate_sigma = math.hypot(clock.known_s, sigma_s), rate_sigma
         clock.correction_s, clock.since_ns = clock.at(frame.t_ns) - 1e-9 * jump.ahead_ns, frame.t_ns
-        clock.reported_s, clock.sigma_s, clock.rate = clock.correction_s, sigma_s, 0.0
+        if not jump.ahead_ns:
+            return sigma_s, rate_sigma
+        clock.reported_s, clock.rate = clock.correction_s, 0.0
         message = "camera %s: its stamps jumped by %.0f ms; they are corrected, now by %.1f ms"
         log.warning(message, name, 1e-6 * jump.ahead_ns, 1e3 * clock.at(frame.t_ns), extra=about(name))
         return sigma_s, rate_sigma
@@ -146,7 +149,7 @@ class CameraClocks:
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None if that time is in the future."""
         name, clock = frame.camera, self._clocks[frame.camera]
-        if clock.since_ns or clock.sigma_s:
+        if clock.since_ns or clock.known_s:
             correction_s, sigma_s = clock.at(frame.t_ns), math.hypot(frame.clock_sigma_s, clock.known_s)
             if clock.is_off and abs(correction_s - clock.reported_s) > REPORTED_S + abs(clock.reported_s):
                 clock.reported_s = correction_s
@@ -164,6 +167,11 @@ class CameraClocks:
         clock.correction_s, clock.since_ns = clock.at(t_ns) + departure.offset_s, t_ns
         clock.rate, clock.sigma_s = clock.rate + departure.rate, departure.sigma_s
         clock.rate_sigma = departure.rate_sigma
+
+    def doubt(self, offsets_s: Mapping[str, float]) -> None:
+        """Count offsets that robots may show, by camera, as uncertainty of their clocks; others are not in doubt."""
+        for name, clock in self._clocks.items():
+            clock.doubt_s = offsets_s.get(name, 0.0)
 
     def hold_common_rate(self, t_ns: int) -> None:
         """Let no rate be common to most clocks from a time on: robots show differences only, and each departure may

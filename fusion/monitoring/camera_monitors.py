@@ -8,7 +8,7 @@ from calib.rig.camera import Camera
 from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
-from fusion.model.states import Snapshot
+from fusion.model.states import FrameSetFit, Snapshot
 from fusion.monitoring.camera_clocks import CameraClocks, uncertain
 from fusion.monitoring.frozen_images import FrozenImages
 from fusion.rig_graph.rig_monitor import RigMonitor
@@ -65,14 +65,14 @@ class CameraMonitors:
         self,
         frame_set: FrameSet,
         now: Snapshot,
+        fit: FrameSetFit,
         recalibrates: bool,
-        is_doubtful: bool,
-        displaced: Mapping[int, int],
     ) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         """Exclude moved cameras, apply recalibrated poses and correct clocks; see `RigMonitor.check`."""
-        corrections = self.rig.check(frame_set, now, recalibrates, is_doubtful, displaced)
+        corrections = self.rig.check(frame_set, now, fit, recalibrates)
         for departure in self.rig.take_departures():
             self.clocks.correct(departure)
+        self.clocks.doubt(self.rig.clock_doubts)
         self.clocks.hold_common_rate(frame_set.t_ns)
         for correction in corrections:
             if correction.placed:

@@ -34,6 +34,11 @@ class ResidualMonitor:
         """Standard deviation that covers calibration errors: as the residuals show, `SLACK_PX` until they are known."""
         return min(SLACK_PX, SLACK_RATIO * self._usual_px) if self._learned >= LEARNED else SLACK_PX
 
+    @property
+    def usual_cost(self) -> float:
+        """Of an equation of the median robot: 1 if the claims hold."""
+        return self._usual_cost
+
     def is_unusual(self, cost: Array, count: Index) -> bool:
         """Whether most robots contradict their predictions by more than chance and more than usual.
 

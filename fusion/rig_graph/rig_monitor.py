@@ -33,7 +33,7 @@ from camera_node.geometry.pose import Pose
 from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
-from fusion.model.states import Snapshot
+from fusion.model.states import FrameSetFit, Snapshot
 from fusion.protocol.pose_messages import Contradiction
 from fusion.rig_graph.clock_walk import ClockWalk, Departure
 from fusion.rig_graph.hypotheses import (
@@ -68,7 +68,10 @@ CHECK_NS, SUSPICIOUS_NS = (
     500_000_000,
     200_000_000,
 )  # between two checks: usually, and while cameras contradict
-USUAL_SHARE = 0.1  # of a core, while cameras do not contradict each other
+USUAL_SHARE = 0.1  # of a core, while nothing changes
+# Ratio of the usual costs of frame sets before something changed and after: 5000 ppm had it in 1.2 s, before robots
+# were wrong by 3 mm.
+GREW = 1.5
 CHANGED = 2.0  # ratio of the mean robust costs in both halves of a window in which something changed
 USUAL = (
     0.2  # mean robust cost that shows nothing: twice that of Gaussian noise, E[log(1 + chi2_2 / CAUCHY^2)]
@@ -93,6 +96,7 @@ class RigMonitor:
         excluded: names of moved cameras whose poses are not known yet.
         pinned: names of cameras whose poses a user confirmed; these do not change.
         contradicting: names of the cameras of which some are at fault, but the data do not decide which.
+        clock_doubts: by camera, the offset of its clock, s, that a judgement found, until one confirms or refutes it.
         refines: whether poses, lenses and the places of markers are corrected by what robots show of them.
         is_settled: whether the last `check` judged what contradicts the predictions: no clock is searched for.
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
@@ -105,6 +109,7 @@ class RigMonitor:
         self._judged = 0  # jobs that were taken since they were asked for
         self._checked_ns = self._revision = self._n_undecided = 0
         self._pause_ns = 0  # after the last job
+        self._judged_cost = np.inf  # the usual cost of frame sets when the last job began
         self._is_contradicted = False
         self._walk = ClockWalk(len(cameras.names))
         self._departures: tuple[Departure, ...] = ()
@@ -130,6 +135,7 @@ class RigMonitor:
         self.excluded: set[str] = set()
         self.pinned: set[str] = set()
         self.contradicting: tuple[str, ...] = ()
+        self.clock_doubts = dict[str, float]()
 
     def inherit(self, old: "RigMonitor", same: Mapping[int, int]) -> None:
         """Continue with the same cameras and other robots; `same` has old rows by new row."""
@@ -209,31 +215,29 @@ class RigMonitor:
         self,
         frame_set: FrameSet,
         now: Snapshot,
+        fit: FrameSetFit,
         recalibrates: bool,
-        is_doubtful: bool,
-        displaced: Mapping[int, int],
     ) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         """Judge the cameras if it is time; the cameras to exclude, and those to use with another pose.
 
         Args:
             frame_set: with the frames of excluded cameras.
             now: the robots after the update with this frame set.
+            fit: of the robots to the frame set. When it begins to be doubtful, something changed: the keyframes before
+                do not show what is now. If one camera alone is displaced several times, it moved: the others show the
+                robots where they are predicted.
             recalibrates: False for the server of a zone that takes the rig from another.
-            is_doubtful: whether the frame set contradicts the predictions. When that begins, something changed: the
-                keyframes before do not show what is now.
-            displaced: cameras that show most markers of the frame set elsewhere, and in how many in a row. If one alone
-                does so several times, it moved: the others show the robots where they are predicted.
         """
         self.is_settled = False
-        if (excluded := self._exclude_displaced(displaced)) is not None:
+        if (excluded := self._exclude_displaced(fit.displaced)) is not None:
             return (excluded,)
-        is_doubtful = is_doubtful or bool(displaced)
+        is_doubtful = fit.is_doubtful or bool(fit.displaced)
         if is_doubtful and not self._was_doubtful:
             self._forget()
         self._was_doubtful = is_doubtful
         self._remember_moment(frame_set, now)
         if self._keyframes.add(frame_set, now):
-            self._judge(now.t_ns)
+            self._judge(now.t_ns, fit.usual_cost)
         return self._act_on_judgements(now.t_ns, recalibrates)
 
     def _act_on_judgements(
@@ -261,13 +265,15 @@ class RigMonitor:
                 self._start(partial(confirm, judged, *self._given, tuple(self._moments)))
         return ()
 
-    def _judge(self, now_ns: int) -> None:
+    def _judge(self, now_ns: int, usual_cost: float) -> None:
         """Judge the keyframes if it is time."""
         kept = tuple(self._keyframes.kept)
-        wait_ns = SUSPICIOUS_NS if self.is_doubtful else max(CHECK_NS, self._pause_ns)
+        has_changed = self._was_doubtful or bool(self._walk.departed) or usual_cost > GREW * self._judged_cost
+        pause_ns = CHECK_NS if has_changed else max(CHECK_NS, self._pause_ns)
+        wait_ns = SUSPICIOUS_NS if self.is_doubtful else pause_ns
         if self._job is not None or len(kept) < min(WINDOWS) or now_ns < self._checked_ns + wait_ns:
             return
-        self._checked_ns, self._revision = now_ns, self._cameras.revision
+        self._checked_ns, self._revision, self._judged_cost = now_ns, self._cameras.revision, usual_cost
         self._given = self._cameras.as_dict(), self._scale, self._markers  # of this time
         self._given_ns, self._is_confirmed = kept[-1].t_ns, False
         given = self._shapes, self._measured_ns, sorted(self._moved)
@@ -392,14 +398,18 @@ class RigMonitor:
 
         While cameras contradict each other, a window contradicts nothing because their errors count as large: poses
         that drift would look like clocks. A jump of a clock is accepted once several verdicts in a row agree on it: a
-        robot's own motion may look like one.
+        robot's own motion may look like one. Until then the camera's clock is as uncertain as the jump is large.
         """
         self._clocks = [*self._clocks, *verdict.cameras] if verdict.cause == "clock" else []
         if len(set(self._clocks)) > 1:
             self._clocks = self._clocks[-1:]
         k = verdict.cameras[0] if verdict.cause == "clock" else -1
-        if k >= 0 and len(self._clocks) >= CONFIRMED:
-            self._walk.jump(k, abs(float(verdict.fit.errors[k, CAUSES["clock"]][0])), 0.0)
+        offset_s = abs(float(verdict.fit.errors[k, CAUSES["clock"]][0]))
+        if k >= 0 and len(self._clocks) < CONFIRMED:
+            self.clock_doubts[self._cameras.names[k]] = offset_s
+            return
+        if k >= 0:
+            self._walk.jump(k, offset_s, 0.0)
         elif verdict.cameras or self.excluded or self.contradicting:
             return
         if measured is None:
@@ -407,6 +417,7 @@ class RigMonitor:
         self._measured_ns = self._given_ns
         if self._walk.update(*measured[0]):
             self._departures = self._walk.take_departures()
+            self.clock_doubts.clear()
 
     def _note_shapes(self, verdict: Verdict, measured: Measured | None) -> None:
         """Use the markers of robots where windows show them, if no camera may be at fault."""

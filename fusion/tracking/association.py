@@ -43,10 +43,8 @@ from fusion.model.observations import (
 from fusion.model.states import POSITION, VELOCITY, States
 from fusion.tracking.assignment import assign
 from fusion.tracking.estimator import Estimator, Prediction
-from fusion.tracking.labelings import MISSED, Labeling, find_labelings
+from fusion.tracking.labelings import MISSED, Labelings, find_labelings
 from fusion.tracking.rays import GATE
-
-MAX_DETECTIONS = 1 << 32  # above the number of detections in any frame set
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,12 +56,7 @@ class _AssignedFrames:
     frame: Index
     detection: Index
     marker: Index
-    labelings: tuple[Labeling, ...]
-
-    def rows(self, first: dict[int, int]) -> Index:
-        """Rows of the detections in a frame set, where a frame starts at `first[id(frame)]`; negative if absent."""
-        start = np.array([first.get(id(frame), -MAX_DETECTIONS) for frame in self.frames], np.intp)
-        return start[self.frame] + self.detection
+    labelings: Labelings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,30 +121,33 @@ class Association:
         detections = DetectionTable.of(FrameSet(self.t_ns, new), self.cameras)
         detection, marker, labelings = self._assign(detections)
         frame, first = detections.frame[detection], _first_rows(new)
-        local = tuple(replace(one, detection=one.detection - first[one.frame]) for one in labelings)
+        local = replace(labelings, detection=labelings.detection - first[labelings.frame[labelings.number]])
         part = _AssignedFrames(new, frame, detection - first[frame], marker, local)
         return replace(self, parts=(*self.parts, part))
 
-    def collect(self, frame_set: FrameSet) -> tuple[DetectionTable, Assignments, list[Labeling]]:
+    def collect(self, frame_set: FrameSet) -> tuple[DetectionTable, Assignments, Labelings]:
         """All detections of the frame set, its assignments in the order of the detections, and other labelings that
         are hardly less probable."""
         detections = DetectionTable.of(frame_set, self.cameras)
-        first = dict(zip(map(id, frame_set.frames), _first_rows(frame_set.frames).tolist(), strict=True))
-        marker_of = np.full(len(detections), -1)
-        for part in self.parts:
-            rows = part.rows(first)
-            marker_of[rows[rows >= 0]] = part.marker[rows >= 0]
-        detection = np.flatnonzero(marker_of >= 0)
         number = {id(frame): k for k, frame in enumerate(frame_set.frames)}
-        labelings = [
-            replace(one, frame=number[at], detection=one.detection + first[at])
-            for part in self.parts
-            for one in part.labelings
-            if (at := id(part.frames[one.frame])) in first
-        ]
-        return detections, Assignments.of(detection, marker_of[detection]), labelings
+        first = np.append(_first_rows(frame_set.frames), 0)
+        marker_of = np.full(len(detections), -1)
+        labelings = list[Labelings]()
+        for part in self.parts:
+            frame = np.array([number.get(id(one), -1) for one in part.frames], np.intp)  # -1: not in the set
+            used = frame[part.frame] >= 0
+            marker_of[first[frame[part.frame[used]]] + part.detection[used]] = part.marker[used]
+            others = part.labelings.select(frame[part.labelings.frame] >= 0)
+            at = frame[others.frame]
+            labelings.append(replace(others, frame=at, detection=others.detection + first[at[others.number]]))
+        detection = np.flatnonzero(marker_of >= 0)
+        return (
+            detections,
+            Assignments.of(detection, marker_of[detection]),
+            Labelings.none().joined(*labelings),
+        )
 
-    def _assign(self, detections: DetectionTable) -> tuple[Index, Index, list[Labeling]]:
+    def _assign(self, detections: DetectionTable) -> tuple[Index, Index, Labelings]:
         """Rows of the detections and of the marker table, and other labelings."""
         exposures = detections.exposures
         poses = self.cameras.frame_poses(self.states, exposures)

@@ -13,7 +13,6 @@ Where a rotation is not known to half a radian, detections of one camera alone a
 they are labeled wrongly.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -21,6 +20,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from fusion import _core
 from fusion.model.observations import (
     Assignments,
     CameraArray,
@@ -33,10 +33,10 @@ from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.rays import GATE
 
 MISSED = np.log(0.1)  # 1 - P_D of a marker that was usually seen
-# Bounds of the time of a frame set: 64 views were searched in 20 ms of a core, 100 labelings compared in 15. Of more,
-# as after a start of many robots, the others stay as assigned.
-MAX_VIEWS, MAX_LABELINGS = 64, 100  # the labelings are the most doubtful ones
-MAX_CHOICES, MAX_STEPS = 64, 5_000  # labelings of one view, and steps of their search
+# Bounds of the time of a frame set: a comparison of 100 labelings took 6 ms of a core. Of more, as after a start of
+# many robots, these are the most doubtful ones, and the others stay as assigned.
+MAX_LABELINGS = 100
+MAX_OF_VIEW, MAX_STEPS = 64, 5_000  # labelings of one view, and steps of their search
 # Probability of the cost of a labeling below which it contradicts the model. A robot carried by 0.3 m had 5e-7;
 # with 1e-3 some right labelings of sparse frame sets were not compared.
 IMPOSSIBLE = 1e-5
@@ -44,21 +44,52 @@ ROUNDS = 3  # in which better labelings replace those before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Labeling:
-    """Another assignment of the markers that a frame shows of a robot.
+class Labelings:
+    """L other assignments of the markers that a frame shows of a robot.
 
     Attributes:
-        robot, frame: the view.
+        robot, frame: (L,) the view.
+        margin: (L,) by how much twice the negative log-likelihood of the frame is higher, each marker by itself.
+        number: (K,) of the labeling that each pair is of, ascending.
         detection: (K,) rows of detections.
         marker: (K,) rows of the marker table.
-        margin: by how much twice the negative log-likelihood of the frame is higher, each marker by itself.
     """
 
-    robot: int
-    frame: int
+    robot: Index
+    frame: Index
+    margin: Array
+    number: Index
     detection: Index
     marker: Index
-    margin: float
+
+    def __len__(self) -> int:
+        return len(self.robot)
+
+    @classmethod
+    def none(cls) -> "Labelings":
+        """No labeling."""
+        no = np.empty(0, np.intp)
+        return cls(no, no, np.empty(0), no, no, no)
+
+    def select(self, chosen: Mask) -> "Labelings":
+        """Those of a mask (L,)."""
+        pairs = chosen[self.number]
+        number = (np.cumsum(chosen) - 1)[self.number[pairs]]
+        views = self.robot[chosen], self.frame[chosen], self.margin[chosen]
+        return Labelings(*views, number, self.detection[pairs], self.marker[pairs])
+
+    def joined(self, *others: "Labelings") -> "Labelings":
+        """These, then the others."""
+        parts = self, *others
+        first = np.cumsum([0, *map(len, parts)])
+        return Labelings(
+            np.concatenate([part.robot for part in parts]),
+            np.concatenate([part.frame for part in parts]),
+            np.concatenate([part.margin for part in parts]),
+            np.concatenate([part.number + k for part, k in zip(parts, first, strict=False)]),
+            np.concatenate([part.detection for part in parts]),
+            np.concatenate([part.marker for part in parts]),
+        )
 
 
 def find_labelings(
@@ -68,10 +99,8 @@ def find_labelings(
     cost: Array,
     robot: Index,
     chosen: Index,
-) -> list[Labeling]:
+) -> Labelings:
     """The other labelings of frames that are hardly less probable, each marker by itself.
-
-    The numbers of views and of labelings are bounded; what is above the bounds stays as it was assigned.
 
     Args:
         cameras: cameras of the rig.
@@ -85,25 +114,36 @@ def find_labelings(
     of_detection = pairs[1] * n + robot
     shared = np.bincount(of_detection)[of_detection] > 1
     if not shared.any():
-        return []
+        return Labelings.none()
     cost = cost + 3 * np.log(2 * np.pi) - unpaired_cost(cameras, detections)[frame]
     view = frame * n + robot
     owner = np.full(len(detections), -1)
     owner[pairs[1, chosen]] = chosen
     vague = _vague_views(pairs, cost, frame * (np.max(pairs[0]) + 1) + pairs[0], owner, view, shared)
     of = owner[pairs[1]]
-    free = np.flatnonzero((of < 0) | (view[of] == view))  # pairs of detections that no other robot has
+    # Pairs of detections that no other robot has.
+    free = np.flatnonzero(np.isin(view, vague) & ((of < 0) | (view[of] == view)))
     free = free[np.argsort(view[free], kind="stable")]
-    found = list[Labeling]()
-    for at in vague[:: max(1, -(-len(vague) // MAX_VIEWS))].tolist():
-        rows = free[slice(*np.searchsorted(view[free], [at, at + 1]))]
-        own = np.flatnonzero(of[rows] == rows)
-        present = float(cost[rows[own]].sum())
-        for choice, total in _choices(pairs[:, rows], cost[rows], len(own) - 1, present + GATE):
-            if choice != own.tolist():
-                detection, marker = pairs[1, rows[choice]], pairs[0, rows[choice]]
-                found.append(Labeling(at % n, at // n, detection, marker, total - present))
-    return found
+    place = np.searchsorted(vague, view[free])  # of the view of each
+    is_own = of[free] == free
+    own = np.bincount(place, is_own, len(vague)).astype(np.intp)
+    present = np.bincount(place, np.where(is_own, cost[free], 0.0), len(vague))
+    first, (marker, detection) = np.searchsorted(place, np.arange(len(vague) + 1)), pairs[:, free]
+    at, total, number, rows = _core.labelings(
+        first,
+        marker,
+        detection,
+        cost[free],
+        own - 1,
+        np.asarray(present + GATE, float),
+        MAX_STEPS,
+        MAX_OF_VIEW,
+    )
+    found = Labelings(
+        vague[at] % n, vague[at] // n, total - present[at], number, detection[rows], marker[rows]
+    )
+    unchanged = np.bincount(number, is_own[rows], len(at))
+    return found.select((unchanged < own[at]) | (np.bincount(number, minlength=len(at)) > own[at]))
 
 
 def choose_labelings(
@@ -113,7 +153,7 @@ def choose_labelings(
     unknown: Mask,
     detections: DetectionTable,
     assignments: Assignments,
-    labelings: Sequence[Labeling],
+    labelings: Labelings,
 ) -> Assignments:
     """The assignments with the best labelings, without pairs that others, hardly less probable, do not have.
 
@@ -127,30 +167,28 @@ def choose_labelings(
         labelings: others that may be right.
     """
     assignments = _without_unchecked(markers, detections, assignments, unknown)
-    robots = set(markers.robot[assignments.marker].tolist())
-    others = [labeling for labeling in labelings if labeling.robot in robots]
-    if not others:
+    others = labelings.select(np.isin(labelings.robot, markers.robot[assignments.marker]))
+    if not len(others):
         return assignments
-    others = sorted(others, key=lambda labeling: labeling.margin)[:MAX_LABELINGS]
+    others = others.select(np.isin(np.arange(len(others)), np.argsort(others.margin)[:MAX_LABELINGS]))
     margins_of = partial(_margins, estimator, markers, prediction, detections)
     margins = margins_of(assignments, others)
     for _ in range(ROUNDS):
         better = _best_of_robots(others, margins)
-        if not better:
+        if not better.any():
             break
-        for k in better:
-            assignments, others[k] = _exchange(markers, detections, assignments, others[k])
-        changed = {others[k].robot for k in better}
-        rows = [k for k, other in enumerate(others) if other.robot in changed]
-        margins[rows] = margins_of(assignments, [others[k] for k in rows])
-    robot, frame = markers.robot[assignments.marker], detections.frame[assignments.detection]
-    undecided = np.zeros(len(robot), bool)
-    for k in np.flatnonzero(margins < GATE).tolist():
-        other, row = others[k], np.flatnonzero((robot == others[k].robot) & (frame == others[k].frame))
-        pairs = np.column_stack([assignments.marker[row], assignments.detection[row]])
-        shared = (pairs[:, None] == np.column_stack([other.marker, other.detection])).all(2).any(1)
-        undecided[row[~shared]] = True
-    return assignments.select(~undecided)
+        present = list[Labelings]()
+        for k in np.flatnonzero(better):
+            assignments, before = _exchange(
+                markers, detections, assignments, others.select(np.arange(len(others)) == k)
+            )
+            present.append(before)
+        changed = others.robot[better]
+        others, margins = others.select(~better).joined(*present), margins[~better]
+        again = np.isin(others.robot, changed)
+        margins = np.concatenate([margins, np.empty(len(present))])
+        margins[again] = margins_of(assignments, others.select(again))
+    return assignments.select(~_is_undecided(markers, detections, assignments, others.select(margins < GATE)))
 
 
 def _without_unchecked(
@@ -171,14 +209,13 @@ def _margins(
     prediction: Prediction,
     detections: DetectionTable,
     assignments: Assignments,
-    others: Sequence[Labeling],
+    others: Labelings,
 ) -> Array:
-    """(K,) by how much the costs of the robots are higher with each of K other labelings: twice the negative logarithms
+    """(L,) by how much the costs of the robots are higher with each of L other labelings: twice the negative logarithms
     of the probabilities of all detections, given the prediction, by Laplace's approximation; infinite for those that
     contradict the prediction or each other."""
-    of_other = np.array([labeling.robot for labeling in others], np.intp)
-    robots = np.unique(of_other)
-    bodies = np.concatenate([robots, of_other])
+    robots, at = np.unique(others.robot, return_inverse=True)
+    bodies = np.concatenate([robots, others.robot])
     body, tried = _tried(markers, detections, assignments, robots, others)
     observations = MatchedObservations.of(tried, detections, markers).with_bodies(body)
     estimator, states = estimator.select(bodies), prediction.states.select(bodies)
@@ -188,7 +225,7 @@ def _margins(
     of_none = unpaired_cost(estimator.cameras, detections)[prepared.detections.frame]
     cost = fit.cost + np.bincount(body, noise - of_none, len(bodies)) - np.linalg.slogdet(fit.states.P)[1]
     most = chi2.isf(IMPOSSIBLE, 2 * np.maximum(np.bincount(body, minlength=len(bodies)), 1))
-    n, at = len(robots), np.searchsorted(robots, of_other)
+    n = len(robots)
     margins: Array = np.where(fit.cost < most, cost, np.inf)[n:] - cost[at]
     return margins
 
@@ -198,41 +235,58 @@ def _tried(
     detections: DetectionTable,
     assignments: Assignments,
     robots: Index,
-    others: Sequence[Labeling],
+    others: Labelings,
 ) -> tuple[Index, Assignments]:
     """The assignments of robots, and those of the robots of other labelings with one view labeled otherwise; and the
     number of the robot or labeling of each."""
-    robot, frame = markers.robot[assignments.marker], detections.frame[assignments.detection]
-    own = {k: np.flatnonzero(robot == k) for k in robots.tolist()}
-    rest = {(one.robot, one.frame): own[one.robot][frame[own[one.robot]] != one.frame] for one in others}
-    none = np.empty(0, np.intp)
-    parts = [(rows, none, none) for rows in own.values()]
-    parts += [(rest[one.robot, one.frame], one.detection, one.marker) for one in others]
-    detection = [part for rows, added, _ in parts for part in (assignments.detection[rows], added)]
-    marker = [part for rows, _, added in parts for part in (assignments.marker[rows], added)]
-    body = np.repeat(np.arange(len(parts)), [len(rows) + len(added) for rows, added, _ in parts])
-    return body, Assignments.of(np.concatenate(detection), np.concatenate(marker))
+    own = assignments.select(np.isin(markers.robot[assignments.marker], robots))
+    robot, frame = markers.robot[own.marker], detections.frame[own.detection]
+    is_kept = (robot == others.robot[:, None]) & (frame != others.frame[:, None])
+    labeling, kept = np.nonzero(is_kept)
+    body = np.concatenate(
+        [np.searchsorted(robots, robot), *(len(robots) + k for k in (labeling, others.number))]
+    )
+    tried = own.joined(own.select(kept), Assignments.of(others.detection, others.marker))
+    order = np.argsort(body, kind="stable")
+    return body[order], tried.select(order)
 
 
-def _best_of_robots(others: Sequence[Labeling], margins: Array) -> list[int]:
-    """Of each robot the labeling that is better than the present one, if there is one, and better than the others."""
-    best: dict[int, int] = {}
-    for k in np.argsort(margins).tolist():
-        if margins[k] < 0:
-            best.setdefault(others[k].robot, k)
-    return list(best.values())
+def _best_of_robots(others: Labelings, margins: Array) -> Mask:
+    """(L,) of each robot the labeling that is better than the present one, if there is one, and than the others."""
+    best = np.zeros(len(others), bool)
+    order = np.argsort(margins)
+    best[order[np.unique(others.robot[order], return_index=True)[1]]] = True
+    return best & (margins < 0)
 
 
 def _exchange(
-    markers: MarkerTable, detections: DetectionTable, assignments: Assignments, other: Labeling
-) -> tuple[Assignments, Labeling]:
-    """The assignments with another labeling of a view, whose detections others lose; and the labeling before."""
+    markers: MarkerTable, detections: DetectionTable, assignments: Assignments, other: Labelings
+) -> tuple[Assignments, Labelings]:
+    """The assignments with one other labeling of a view, whose detections others lose; and the labeling before."""
     robot, frame = markers.robot[assignments.marker], detections.frame[assignments.detection]
     own = (robot == other.robot) & (frame == other.frame)
-    before = replace(other, detection=assignments.detection[own], marker=assignments.marker[own])
+    number = np.zeros(own.sum(), np.intp)
+    before = replace(
+        other, number=number, detection=assignments.detection[own], marker=assignments.marker[own]
+    )
     rest = assignments.select(~own & ~np.isin(assignments.detection, other.detection))
     joined = rest.joined(Assignments.of(other.detection, other.marker))
     return joined.select(np.argsort(joined.detection, kind="stable")), before
+
+
+def _is_undecided(
+    markers: MarkerTable, detections: DetectionTable, assignments: Assignments, possible: Labelings
+) -> Mask:
+    """(N,) assignments that not all possible labelings of their views have."""
+    n = len(detections.exposures.camera)
+    view = markers.robot[assignments.marker] * n + detections.frame[assignments.detection]
+    others = possible.robot * n + possible.frame
+    n_others = np.bincount(others, minlength=np.max(view, initial=0) + 1)
+    marker = np.full(len(detections), -1)
+    marker[assignments.detection] = assignments.marker
+    shared = possible.detection[marker[possible.detection] == possible.marker]
+    undecided: Mask = np.bincount(shared, minlength=len(detections))[assignments.detection] < n_others[view]
+    return undecided
 
 
 def _vague_views(
@@ -257,40 +311,6 @@ def _vague_views(
     loss = np.where(of >= 0, other[of_marker[of]] - cost[of], 0.0)  # of the marker whose detection it is now
     possible = shared & ~is_chosen & (cost - present[of_marker] + loss < GATE)
     return np.intersect1d(view[possible], view[chosen])
-
-
-def _choices(pairs: Index, cost: Array, least: int, limit: float) -> list[tuple[list[int], float]]:
-    """The choices of pairs without a common row whose sum of costs is below a limit, and these sums; by depth-first
-    search within `MAX_CHOICES` and `MAX_STEPS`.
-
-    Args:
-        pairs: (2, K), by ascending first row.
-        cost: (K,).
-        least: how many pairs a choice has at least.
-        limit: of the sum.
-    """
-    marker, detection, costs = pairs[0].tolist(), pairs[1].tolist(), cost.tolist()
-    n = len(costs)
-    after = np.searchsorted(pairs[0], pairs[0], "right").tolist()  # the first pair of the next marker
-    best, left = [0.0] * (n + 1), [0] * (n + 1)  # of the pairs from here on: the lowest sum, and most markers
-    for k in range(n - 1, -1, -1):
-        best[k] = min(best[k + 1], costs[k] + best[after[k]])
-        left[k] = 1 + left[after[k]]
-    found: list[tuple[list[int], float]] = []
-    open_ = [(0, list[int](), 0.0)]
-    for _ in range(MAX_STEPS):
-        if not open_ or len(found) == MAX_CHOICES:
-            break
-        k, rows, total = open_.pop()
-        if total + best[k] >= limit or len(rows) + left[k] < least:
-            continue
-        if k == n:
-            found.append((rows, total))
-            continue
-        open_.append((k + 1, rows, total))
-        if not rows or (marker[rows[-1]] != marker[k] and detection[k] not in [detection[i] for i in rows]):
-            open_.append((k + 1, [*rows, k], total + costs[k]))
-    return found
 
 
 def unpaired_cost(cameras: CameraArray, detections: DetectionTable) -> Array:

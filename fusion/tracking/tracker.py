@@ -15,7 +15,7 @@ from fusion.model.limits import Limits
 from fusion.model.marker_places import PLACE_M
 from fusion.model.observations import Assignments, CameraArray, DetectionTable
 from fusion.model.robots import Robot
-from fusion.model.states import Snapshot
+from fusion.model.states import FrameSetFit, Snapshot
 from fusion.monitoring.camera_monitors import CameraMonitors
 from fusion.monitoring.size_check import SizeCheck
 from fusion.protocol.arena_health import describe_contradiction
@@ -189,11 +189,9 @@ class Tracker:
     def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
         now = Snapshot(frame_set.t_ns, self.table.states, self.table.located)
-        is_doubtful, displaced = self.robust.is_doubtful, self.own.displaced
-        corrections = self.monitors.check_extrinsics(
-            frame_set, now, self._recalibrates, is_doubtful, displaced
-        )
-        if self.monitors.rig.is_settled and is_doubtful:
+        fit = FrameSetFit(self.robust.is_doubtful, self.robust.usual_cost, self.own.displaced)
+        corrections = self.monitors.check_extrinsics(frame_set, now, fit, self._recalibrates)
+        if self.monitors.rig.is_settled and fit.is_doubtful:
             self.robust.settle()
         if corrections or self.monitors.rig.take_placed():
             self.claims.forget()

@@ -10,6 +10,7 @@ import random
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -71,6 +72,8 @@ class Chaos:
         fault.end()
         episode.ended_s = clock.now_s()
         self._look((episode, evidence), self.rng.uniform(*PAUSE_S))
+        while fault.report and episode.reported_s is None and clock.now_s() < episode.ended_s + SETTLE_S:
+            self._look((episode, evidence), STEP_S)
 
     def _look(self, current: tuple[Episode, Evidence] | None, seconds: float) -> None:
         """Follow logs and status for a time."""
@@ -135,10 +138,10 @@ def chaos(
 
 
 def virtual_chaos(
-    folder: Path, seconds: float, seed: int, kinds: Sequence[str] = VIRTUAL
+    folder: Path, seconds: float, seed: int, kinds: Sequence[str] = VIRTUAL, judging_s: float = 0.0
 ) -> Iterator[float | ChaosResult]:
     """The same in virtual time; the kinds are faults of cameras and robots."""
-    with VirtualArena(folder, small_load(), seed) as arena:
+    with VirtualArena(folder, small_load(), seed, judging_s=judging_s) as arena:
         arena.wait(2 * SETTLE_S)
         arena.judge.forget()
         arena.new_lines()
@@ -148,7 +151,11 @@ def virtual_chaos(
 
 
 def main(
-    minutes: float = 30.0, seed: int = 1, kinds: tuple[str, ...] = tuple(KINDS), virtual: bool = False
+    minutes: float = 30.0,
+    seed: int = 1,
+    kinds: tuple[str, ...] = tuple(KINDS),
+    virtual: bool = False,
+    judging_s: float = 0.4,
 ) -> int:
     """Print what each kind of fault caused and who reported it; exit code 1 if something does not hold.
 
@@ -157,12 +164,13 @@ def main(
         seed: of the choices.
         kinds: of faults.
         virtual: in virtual time, without network and processes; of the kinds those of cameras and robots.
+        judging_s: how long a judgement of the cameras takes in virtual time: 0.4 s of a process with few processors.
     """
     result = ChaosResult()
     if virtual:
         kinds = tuple(kind for kind in kinds if kind in VIRTUAL)
     folder = Path(tempfile.mkdtemp(prefix="roundel-chaos-"))
-    run = virtual_chaos if virtual else chaos
+    run = partial(virtual_chaos, judging_s=judging_s) if virtual else chaos
     for step in track(run(folder, 60 * minutes, seed, kinds), "chaos"):
         if isinstance(step, ChaosResult):
             result = step

@@ -6,6 +6,7 @@
 #include "arrays.hpp"
 #include "candidates.hpp"
 #include "inverse_lens.hpp"
+#include "labelings.hpp"
 
 namespace roundel::fusion {
 namespace {
@@ -71,6 +72,42 @@ auto candidates(const ExpectedMarkers& markers, const FramePoses& poses, const D
     return std::make_tuple(pairs, costs);
 }
 
+/// The pairs of view v are those from first[v] to first[v + 1].
+auto labelings(const Index& first, const Index& marker, const Index& detection, const Numbers& cost,
+               const Index& least, const Numbers& most, size_t max_steps, size_t max_labelings) {
+    const size_t views = least.size(), n = cost.size();
+    require_equal(views + 1, {first.size(), most.size() + 1});
+    require_equal(n, {marker.size(), detection.size()});
+    const int64_t* const starts = first.data();
+    if (starts[0] != 0 || starts[views] != int64_t(n) || !std::is_sorted(starts, starts + views + 1))
+        throw nb::index_error("views do not divide the pairs");
+    std::vector<std::vector<Labeling>> found(views);
+    unlocked([&] {
+        for (size_t v = 0; v < views; ++v) {
+            const size_t k = size_t(first(v));
+            const MarkerPairs pairs{marker.data() + k, detection.data() + k, cost.data() + k,
+                                    size_t(first(v + 1)) - k};
+            found[v] = find_labelings(pairs, least(v), most(v), {max_steps, max_labelings});
+        }
+    });
+    size_t total = 0, rows = 0;
+    for (const auto& of_view : found)
+        for (const Labeling& one : of_view) ++total, rows += one.pairs.size();
+    auto [view, to_view] = make<int64_t>({total});
+    auto [costs, to_cost] = make({total});
+    auto [labeling, to_labeling] = make<int64_t>({rows});
+    auto [pair, to_pair] = make<int64_t>({rows});
+    int64_t number = 0;
+    for (size_t v = 0; v < views; ++v)
+        for (const Labeling& one : found[v]) {
+            *to_view++ = int64_t(v);
+            *to_cost++ = one.cost;
+            to_labeling = std::fill_n(to_labeling, one.pairs.size(), number++);
+            for (const int64_t k : one.pairs) *to_pair++ = first(v) + k;
+        }
+    return std::make_tuple(view, costs, labeling, pair);
+}
+
 constexpr double kMinAxis = 0.5, kMaxAxis = 1e5;  // of a plausible outline, pixels
 constexpr double kRounding = 1.001;               // of the axes of a circle, as floats of another program
 
@@ -128,6 +165,7 @@ void bind_detections(nb::module_& m) {
         .def("__init__", &make_expected)
         .def("covariances", &covariances)
         .def("candidates", &candidates);
+    m.def("labelings", &labelings);
     m.def("measure", &measure);
 }
 

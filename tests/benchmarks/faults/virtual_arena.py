@@ -21,6 +21,7 @@ from fusion.server.arena_config import ArenaConfig
 from fusion.server.server import Server
 from tests.benchmarks.faults.camera import SceneCamera, SceneDetector
 from tests.benchmarks.faults.judge import PoseJudge
+from tests.benchmarks.faults.late_results import LateResults
 from tests.benchmarks.faults.world import CameraFault, Clock, RobotEvent, World
 from tests.benchmarks.fusion_load import START_NS, Load
 
@@ -74,6 +75,7 @@ class VirtualArena:
         rig: the server's calibration, if it is not the true one.
         robots: the server's robots, if they are not the true ones.
         judge: the class that judges poses.
+        judging_s: how long a judgement of the cameras takes.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class VirtualArena:
         rig: Rig | None = None,
         robots: dict[str, Robot] | None = None,
         judge: type[PoseJudge] = PoseJudge,
+        judging_s: float = 0.0,
     ) -> None:
         self.load, self.clock = load, VirtualClock()
         self.world = World(load, START_NS)
@@ -101,6 +104,7 @@ class VirtualArena:
         self._tick_ns = START_NS
         self._log = _Lines()
         self._folder = folder
+        self._judging = LateResults(judging_s, self.clock.now_s) if judging_s else None
         save_rig(rig or Rig(cameras=load.rig), folder / "rig.yaml")
         self.server = self._server()
 
@@ -166,6 +170,7 @@ class VirtualArena:
         self._outbox = Outbox(self.judge)
         server.transport = self._outbox  # pyright: ignore[reportAttributeAccessIssue]
         server.zones = None
+        server.pipeline.judge_cameras_in(self._judging)
         return server
 
     def _schedule(self, name: str, seq: int) -> None:
@@ -203,6 +208,8 @@ class VirtualArena:
         self._serve()
 
     def _serve(self) -> None:
+        if self._judging is not None:
+            self._judging.release()
         is_backlogged = bool(self._arrivals) and self._arrivals[0][0] < self.clock.t_ns
         self.server._fuse(self.clock.t_ns, is_backlogged)
         self.status = self.server._report_status(self.clock.t_ns) or self.status

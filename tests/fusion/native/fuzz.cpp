@@ -11,6 +11,7 @@
 
 #include "candidates.hpp"
 #include "inverse_lens.hpp"
+#include "labelings.hpp"
 #include "motion_model.hpp"
 #include "ray_intersections.hpp"
 
@@ -144,6 +145,25 @@ bool associate(Random& random, double wild) {
     return true;
 }
 
+/// Labelings have existing pairs without a common marker or detection, and not fewer than the least.
+bool label(Random& random, double wild) {
+    const size_t n = random.below(30);
+    Indices marker = random.indices(n, 6);
+    std::sort(marker.begin(), marker.end());
+    const Indices detection = random.indices(n, 5);
+    const Numbers cost = random.numbers(n, 9, wild);
+    const int64_t least = int64_t(random.below(4));
+    for (const Labeling& one :
+         find_labelings({marker.data(), detection.data(), cost.data(), n}, least, 5, {2000, 64})) {
+        std::vector<char> markers(6), detections(5);
+        for (const int64_t k : one.pairs)
+            if (markers.at(size_t(marker.at(size_t(k))))++ || detections.at(size_t(detection[size_t(k)]))++)
+                return false;
+        if (int64_t(one.pairs.size()) < least) return false;
+    }
+    return true;
+}
+
 /// The densest range of a ray is a possible one, or NaN; pairs are of rays that miss each other by little.
 bool intersect(Random& random, double wild) {
     const size_t frames = 1 + random.below(5), n = random.below(60), sizes = 1 + random.below(3);
@@ -186,8 +206,8 @@ int main(int argc, char** argv) {
     Random random(argc > 2 ? unsigned(std::atoi(argv[2])) : 1);
     for (int round = 0; round < rounds; ++round) {
         const double wild = round % 4 == 0 ? 0 : 0.3 / (round % 4 * round % 4 + 1);
-        if (!estimate(random, wild) || !associate(random, wild) || !intersect(random, wild) ||
-            !undistort(random, wild)) {
+        if (!estimate(random, wild) || !associate(random, wild) || !label(random, wild) ||
+            !intersect(random, wild) || !undistort(random, wild)) {
             std::fprintf(stderr, "round %d: impossible result\n", round);
             return 1;
         }

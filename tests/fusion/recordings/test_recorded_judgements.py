@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A replay repeats the poses of a server whose judgements of the cameras came late, as on a busy machine."""
 
-from collections.abc import Callable
-from concurrent.futures import Executor, Future
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 from camera_node.protocol.messages import encode
 from fusion.model.frames import FrameSet
@@ -13,28 +9,11 @@ from fusion.protocol.pose_messages import RobotPose
 from fusion.recordings.offline_fusion import OfflineArena, fuse_frame_sets
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
+from tests.benchmarks.faults.late_results import LateResults
 from tests.fusion.moved_camera import MOVE_S, ROBOTS, moved
 from tests.fusion.synthetic import PERIOD_NS, Arena
 
 DELAY = 7  # frame sets from the start of a judgement to its result
-
-
-class Busy(Executor):
-    """Results come some frame sets later."""
-
-    def __init__(self) -> None:
-        self.waiting: list[tuple[int, Future[Any], Callable[[], Any]]] = []
-
-    def submit(self, fn, /, *args, **kwargs) -> Future[Any]:
-        self.waiting.append((DELAY, Future(), partial(fn, *args, **kwargs)))
-        return self.waiting[-1][1]
-
-    def count_frame_set(self) -> None:
-        self.waiting = [(n - 1, future, run) for n, future, run in self.waiting]
-        for n, future, run in self.waiting:
-            if n <= 0:
-                future.set_result(run())
-        self.waiting = [entry for entry in self.waiting if entry[0] > 0]
 
 
 def frame_sets(before: Arena, after: Arena) -> list[FrameSet]:
@@ -54,15 +33,15 @@ def messages(poses: list[RobotPose]) -> list[bytes]:
 def test_a_replay_takes_judgements_when_the_server_took_them():
     before, after = moved(2.0, 0.0)
     given = frame_sets(before, after)
-    live, busy = Tracker(before.cameras, ROBOTS), Busy()
-    live.monitors.rig.executor = busy
-    poses, recorded = [], []
+    poses, recorded = list[RobotPose](), list[FrameSet]()
+    live, late = Tracker(before.cameras, ROBOTS), LateResults(DELAY, lambda: len(recorded))
+    live.monitors.rig.executor = late
     for frame_set in given:
         poses += live.track(frame_set).poses
-        busy.count_frame_set()
+        late.release()
         live.check_extrinsics(frame_set)
         recorded.append(replace(frame_set, judged=live.monitors.rig.take_judged()))
-    assert sum(frame_set.judged for frame_set in recorded) > 2
+    assert sum(frame_set.judged or 0 for frame_set in recorded) > 2
     arena = OfflineArena(before.cameras, ROBOTS)
     again, at_once = (
         messages([pose for result in fuse_frame_sets(sets, arena) for pose in result.poses])
