@@ -9,6 +9,7 @@ If something does not hold, the folder with the logs stays.
 import random
 import shutil
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,13 +21,17 @@ from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.chaos_result import SETTLE_S, ChaosResult, Episode, report, save_events
 from tests.benchmarks.faults.judge import Gap
 from tests.benchmarks.faults.kinds import KINDS, VIRTUAL
+from tests.benchmarks.faults.programs import END_S
 from tests.benchmarks.faults.reports import Evidence
 from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.fuzz import EXTRA
 
 PAUSE_S = 0.5, 3.0  # between two faults
 STEP_S = 0.05  # between two looks at logs and status
-WAITS_S = 0.2  # between two looks at how long threads waited for a processor
+WAITS_S, MAX_WAITS = (
+    0.2,
+    400,
+)  # between two looks at how long threads waited for a processor, and how many are kept
 
 
 class Chaos:
@@ -78,7 +83,7 @@ class Chaos:
     def _look(self, current: tuple[Episode, Evidence] | None, seconds: float) -> None:
         """Follow logs and status for a time."""
         arena, now_s = self.arena, self.arena.clock.now_s
-        end_s, next_s, waits_s = now_s() + seconds, 0.0, 0.0
+        end_s, next_s = now_s() + seconds, 0.0
         while now_s() < end_s:
             arena.wait(STEP_S)
             lines = [f"{program}: {line}" for program, line in arena.new_lines()]
@@ -87,13 +92,15 @@ class Chaos:
                 evidence.lines += lines
                 if report := current[0].fault.report(evidence):
                     episode.reported_s, episode.report = now_s(), report
-            if now_s() > waits_s:
-                self._waits.append((now_s(), arena.waited_s()))
-                waits_s = now_s() + WAITS_S
             arena.inspect(samples_memory=now_s() > next_s)
             if now_s() > next_s:
                 next_s = now_s() + 1.0
             self._note_gaps()
+
+    def sample_waits(self, ended: threading.Event) -> None:
+        """Note how long threads waited for a processor until the event, also while a fault begins or ends."""
+        while not ended.wait(WAITS_S):
+            self._waits = [*self._waits[-MAX_WAITS:], (self.arena.clock.now_s(), self.arena.waited_s())]
 
     def _note_gaps(self) -> None:
         """Compute the waits of new gaps while the samples are recent."""
@@ -101,7 +108,6 @@ class Chaos:
         for gap in gaps:
             self.result.gaps.append(gap)
             self.result.waits_s[gap] = self._waited_s(gap)
-        del self._waits[:-200]
 
     def _waited_s(self, gap: Gap) -> float:
         """For how long the thread that waited longest for a processor did so around a gap."""
@@ -129,8 +135,14 @@ def chaos(
         arena.wait(SETTLE_S)
         arena.judge.forget()
         arena.programs.new_lines()
-        run = Chaos(arena, random.Random(seed), kinds)
-        yield from run.run(seconds)
+        run, ended = Chaos(arena, random.Random(seed), kinds), threading.Event()
+        sampler = threading.Thread(target=run.sample_waits, args=(ended,), name="waits", daemon=True)
+        sampler.start()
+        try:
+            yield from run.run(seconds)
+        finally:
+            ended.set()
+            sampler.join(END_S)
     run.result.crashes = arena.programs.crashes
     run.result.growths = arena.programs.growths()
     arena.programs.save_memory(folder / "memory.txt")

@@ -84,14 +84,14 @@ class ChaosResult:
         ]
 
     def failures(self) -> list[str]:
-        """What does not hold, one line each."""
+        """What does not hold, one line each, the worst first: a report has the first lines only."""
         return [
             *(f"crash: {crash}" for crash in self.crashes),
-            *(f"not reported: {e.kind} of {e.fault.target}" for e in self.unreported()),
-            *(self._describe(gap, "unexplained gap") for gap in self.unexplained()),
-            *(self._describe(gap, "long gap") for gap in self.longest()),
             *self._describe_wrong(),
             *(f"{name} grows by {growth}" for name, growth in self.growths.items() if growth.is_excessive),
+            *(f"not reported: {e.kind} of {e.fault.target}" for e in self.unreported()),
+            *(self._describe(gap, "long gap") for gap in self.longest()),
+            *(self._describe(gap, "unexplained gap") for gap in self.unexplained()),
         ]
 
     def _describe(self, gap: Gap, what: str) -> str:
