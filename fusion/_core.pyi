@@ -141,8 +141,8 @@ def labelings(
     max_labelings: int,
     /,
 ) -> tuple[Index, Array, Index, Index]:
-    """Choices of pairs without a common marker or detection: their views and costs (L,), and of each pair that they
-    have the choice and the pair (R,).
+    """Choices of pairs without a common marker or detection: view and cost of each choice (L,), and then, for each
+    pair in a choice, the number of the choice and the row of the pair (R,).
 
     Pairs (K,) of markers and detections with costs, by view and ascending marker; those of view v start at `first[v]`
     of (V + 1,). A choice has `least` (V,) pairs or more that cost less than `most` (V,) together. The search ends after

@@ -24,20 +24,19 @@ FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 fram
 
 
 class ResidualMonitor:
-    """The usual residual of a frame set, and the usual cost of its fit."""
+    """The usual residual of a frame set, and the usual cost of its fit.
+
+    Attributes:
+        usual_cost: of an equation of the median robot: 1 if the claims hold.
+    """
 
     def __init__(self) -> None:
-        self._usual_px, self._usual_cost, self._learned = 0.0, 1.0, 0
+        self._usual_px, self.usual_cost, self._learned = 0.0, 1.0, 0
 
     @property
     def slack_px(self) -> float:
         """Standard deviation that covers calibration errors: as the residuals show, `SLACK_PX` until they are known."""
         return min(SLACK_PX, SLACK_RATIO * self._usual_px) if self._learned >= LEARNED else SLACK_PX
-
-    @property
-    def usual_cost(self) -> float:
-        """Of an equation of the median robot: 1 if the claims hold."""
-        return self._usual_cost
 
     def is_unusual(self, cost: Array, count: Index) -> bool:
         """Whether most robots contradict their predictions by more than chance and more than usual.
@@ -49,7 +48,7 @@ class ResidualMonitor:
         n = 2 * int(count.sum())
         if self._learned < LEARNED or not n:
             return False
-        limit = max(float(chdtri(n, FALSE_ALARM)) / n, MIN_RATIO**2 * self._usual_cost)
+        limit = max(float(chdtri(n, FALSE_ALARM)) / n, MIN_RATIO**2 * self.usual_cost)
         return bool(_mean_cost(cost, count) > limit)
 
     def is_explained(self, cost: float, count: int) -> bool:
@@ -59,7 +58,7 @@ class ResidualMonitor:
             cost: what they add to the cost of the fit.
             count: of these detections; they show nothing if they have no more equations than a pose has errors.
         """
-        allowed = chdtri(2 * count, REJOINED) * max(1.0, self._usual_cost)
+        allowed = chdtri(2 * count, REJOINED) * max(1.0, self.usual_cost)
         return 2 * count > POSE_ERRORS and bool(cost < allowed)
 
     def learn(self, squared_px: Array, cost: Array, count: Index) -> None:
@@ -69,7 +68,7 @@ class ResidualMonitor:
         self._learned += 1
         share = 1 / min(self._learned, LEARNED)
         self._usual_px += share * (_median_px(squared_px) - self._usual_px)
-        self._usual_cost += share * (_mean_cost(cost, count) - self._usual_cost)
+        self.usual_cost += share * (_mean_cost(cost, count) - self.usual_cost)
 
 
 def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:

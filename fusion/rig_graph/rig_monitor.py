@@ -69,8 +69,8 @@ CHECK_NS, SUSPICIOUS_NS = (
     200_000_000,
 )  # between two checks: usually, and while cameras contradict
 USUAL_SHARE = 0.1  # of a core, while nothing changes
-# Ratio of the usual costs of frame sets before something changed and after: 5000 ppm had it in 1.2 s, before robots
-# were wrong by 3 mm.
+# Ratio of the usual costs of frame sets, now and when the last judgement began, from which the next one is due: clocks
+# that drifted by 5000 ppm had it after 1 to 2 s; without a fault it varied by a third at most.
 GREW = 1.5
 CHANGED = 2.0  # ratio of the mean robust costs in both halves of a window in which something changed
 USUAL = (

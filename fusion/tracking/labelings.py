@@ -50,7 +50,7 @@ class Labelings:
     Attributes:
         robot, frame: (L,) the view.
         margin: (L,) by how much twice the negative log-likelihood of the frame is higher, each marker by itself.
-        number: (K,) of the labeling that each pair is of, ascending.
+        number: (K,) the labeling of each pair, ascending.
         detection: (K,) rows of detections.
         marker: (K,) rows of the marker table.
     """
@@ -142,8 +142,8 @@ def find_labelings(
     found = Labelings(
         vague[at] % n, vague[at] // n, total - present[at], number, detection[rows], marker[rows]
     )
-    unchanged = np.bincount(number, is_own[rows], len(at))
-    return found.select((unchanged < own[at]) | (np.bincount(number, minlength=len(at)) > own[at]))
+    n_own, n_pairs = np.bincount(number, is_own[rows], len(at)), np.bincount(number, minlength=len(at))
+    return found.select((n_own < own[at]) | (n_pairs > own[at]))
 
 
 def choose_labelings(
@@ -241,12 +241,12 @@ def _tried(
     number of the robot or labeling of each."""
     own = assignments.select(np.isin(markers.robot[assignments.marker], robots))
     robot, frame = markers.robot[own.marker], detections.frame[own.detection]
-    is_kept = (robot == others.robot[:, None]) & (frame != others.frame[:, None])
-    labeling, kept = np.nonzero(is_kept)
+    of_other_views = (robot == others.robot[:, None]) & (frame != others.frame[:, None])
+    labeling, row = np.nonzero(of_other_views)
     body = np.concatenate(
         [np.searchsorted(robots, robot), *(len(robots) + k for k in (labeling, others.number))]
     )
-    tried = own.joined(own.select(kept), Assignments.of(others.detection, others.marker))
+    tried = own.joined(own.select(row), Assignments.of(others.detection, others.marker))
     order = np.argsort(body, kind="stable")
     return body[order], tried.select(order)
 

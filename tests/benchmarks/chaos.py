@@ -21,17 +21,15 @@ from tests.benchmarks.faults.arena import LiveArena, small_load
 from tests.benchmarks.faults.chaos_result import SETTLE_S, ChaosResult, Episode, report, save_events
 from tests.benchmarks.faults.judge import Gap
 from tests.benchmarks.faults.kinds import KINDS, VIRTUAL
-from tests.benchmarks.faults.programs import END_S
+from tests.benchmarks.faults.programs import END_S, Programs
 from tests.benchmarks.faults.reports import Evidence
 from tests.benchmarks.faults.virtual_arena import VirtualArena
 from tests.benchmarks.fuzz import EXTRA
 
 PAUSE_S = 0.5, 3.0  # between two faults
 STEP_S = 0.05  # between two looks at logs and status
-WAITS_S, MAX_WAITS = (
-    0.2,
-    400,
-)  # between two looks at how long threads waited for a processor, and how many are kept
+WAITS_S = 0.2  # between two looks at how long threads waited for a processor
+MAX_WAITS = 400  # looks: longer than a fault takes to end
 
 
 class Chaos:
@@ -97,10 +95,10 @@ class Chaos:
                 next_s = now_s() + 1.0
             self._note_gaps()
 
-    def sample_waits(self, ended: threading.Event) -> None:
+    def sample_waits(self, programs: Programs, ended: threading.Event) -> None:
         """Note how long threads waited for a processor until the event, also while a fault begins or ends."""
         while not ended.wait(WAITS_S):
-            self._waits = [*self._waits[-MAX_WAITS:], (self.arena.clock.now_s(), self.arena.waited_s())]
+            self._waits = [*self._waits[-MAX_WAITS:], (self.arena.clock.now_s(), programs.waited_s())]
 
     def _note_gaps(self) -> None:
         """Compute the waits of new gaps while the samples are recent."""
@@ -136,7 +134,7 @@ def chaos(
         arena.judge.forget()
         arena.programs.new_lines()
         run, ended = Chaos(arena, random.Random(seed), kinds), threading.Event()
-        sampler = threading.Thread(target=run.sample_waits, args=(ended,), name="waits", daemon=True)
+        sampler = threading.Thread(target=run.sample_waits, args=(arena.programs, ended), daemon=True)
         sampler.start()
         try:
             yield from run.run(seconds)

@@ -94,10 +94,6 @@ class LiveArena:
         """The lines that the programs logged since the last call, with the programs' names."""
         return self.programs.new_lines()
 
-    def waited_s(self) -> dict[str, float]:
-        """For how long each thread has waited for a processor."""
-        return self.programs.waited_s()
-
     def inspect(self, samples_memory: bool) -> None:
         """Note programs that ended by themselves, and the memory of all."""
         self.programs.check()

@@ -149,10 +149,6 @@ class VirtualArena:
         lines, self._log.lines = self._log.lines, []
         return [("server", line) for line in lines]
 
-    def waited_s(self) -> dict[str, float]:
-        """Nothing waits for a processor in virtual time."""
-        return {}
-
     def inspect(self, samples_memory: bool) -> None:
         """There are no programs that could end."""
 

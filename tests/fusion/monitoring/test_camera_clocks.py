@@ -178,6 +178,25 @@ def test_a_drift_that_is_not_measured_any_more_becomes_uncertain():
     assert uncertain(replace(frame_set, frames=(admitted, others[0])), 1.0) == set()
 
 
+def test_after_a_jump_a_correction_is_known_no_better_than_before():
+    """A jump is measured exactly. The clock may have been wrong before by as much as its correction, and its rate may
+    have ended."""
+    clocks, sigma_s, rate, rate_sigma = CameraClocks(("cam0", "cam1", "cam2")), 2e-3, 3e-4, 4e-4
+    (frame,) = (f for f in LOAD.frames(1 / LOAD.hz) if f.camera == "cam1")
+    clocks.correct(Departure(1, frame.t_ns, 0.0, rate, sigma_s, rate_sigma))
+    stamps_ns, jump_ns = [frame.t_ns + round(k * PERIOD_S * 1e9) for k in range(31)], 25_000_000
+    for k, t_ns in enumerate(stamps_ns[:-1]):
+        assert clocks.observe(replace(frame, t_ns=t_ns, received_ns=t_ns + 5_000_000 + k % 2)) == (0.0, 0.0)
+    after = replace(frame, t_ns=stamps_ns[-1] + jump_ns, received_ns=stamps_ns[-1] + 5_000_000)
+    of_jump_s, of_rate = clocks.observe(after)
+    assert of_jump_s < 1e-4
+    assert of_rate == pytest.approx(np.hypot(rate, rate_sigma))
+    admitted, elapsed_s = clocks.admit(after), (after.t_ns - frame.t_ns) * 1e-9
+    assert admitted is not None
+    assert admitted.clock_sigma_s == pytest.approx(np.hypot(sigma_s, rate_sigma * elapsed_s), rel=1e-3)
+    assert (after.t_ns - admitted.t_ns) * 1e-9 == pytest.approx(0.025 - rate * elapsed_s, abs=1e-6)
+
+
 @pytest.mark.ci
 @pytest.mark.parametrize(
     ("speed_m_s", "duration_s"),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Faults of cameras in virtual time, by the server's own steps: none of them makes a pose wrong."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -35,15 +36,43 @@ def test_a_faulty_camera_makes_no_pose_wrong(
 
 @pytest.mark.ci
 def test_a_clock_that_drifts_makes_no_pose_wrong_while_judgements_are_late(tmp_path: Path):
-    """A clock drifts by 5000 ppm and is set right after 5 s. Of a busy machine, where a judgement takes 0.4 s and the
-    next begins 4 s later, 39 poses were wrong by up to 158 mm: a drift was found after 3 s, and the correction of a
-    stamp that jumped was held to be as exact as the jump."""
+    """A clock drifts by 5000 ppm and is set right after 5 s, while a judgement takes 0.4 s and the next one begins 4 s
+    later. Before, 11 poses were wrong by up to 158 mm."""
     kinds = ("clock drifts", "clock stepped", "camera silent", "frames doubled", "frames lost")
     *_, result = virtual_chaos(tmp_path, 14.0, 2, kinds, judging_s=0.4)
     assert isinstance(result, ChaosResult)
     assert [episode.kind for episode in result.episodes][:2] == ["clock drifts", "frames lost"]
     assert result.wrong == []
     assert result.poses > 3000
+
+
+@pytest.mark.ci
+def test_a_drift_is_judged_before_a_frame_set_contradicts_the_predictions(tmp_path: Path):
+    """A judgement takes 0.4 s, and the next one begins 4 s later, unless residuals grow. A clock that a judgement
+    blames is uncertain before others confirm that."""
+    with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
+        arena.wait(5.0)
+        tracker = arena.server.pipeline.tracker
+        assert tracker is not None
+        monitors = tracker.monitors
+
+        def begins(within_s: float) -> bool:
+            begun_ns = monitors.rig._checked_ns
+            return _happens(arena, within_s, lambda: monitors.rig._checked_ns > begun_ns)
+
+        assert begins(6.0)
+        arena.place("cam2", CameraFault(drift_ppm=5000.0, since_ns=arena.clock.now_ns()))
+        assert begins(2.0)
+        assert _happens(arena, 3.0, lambda: "cam2" in monitors.rig.clock_doubts)
+        assert not tracker.robust.is_doubtful
+        assert monitors.clocks.health()["cam2"].state == "uncertain"
+
+
+def _happens(arena: VirtualArena, within_s: float, has_happened: Callable[[], bool]) -> bool:
+    until_s = arena.clock.now_s() + within_s
+    while arena.clock.now_s() < until_s and not has_happened():
+        arena.wait(0.05)
+    return has_happened()
 
 
 @pytest.mark.ci
