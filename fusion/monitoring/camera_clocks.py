@@ -11,7 +11,7 @@ See docs/design/time_offsets.md.
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median_high, median_low
 from typing import Literal
@@ -26,6 +26,7 @@ ClockState = Literal["correct", "uncertain", "corrected"]
 REPORTED_S = 0.0005  # smallest correction that is reported; later ones when it has doubled
 MAX_MOTION_M = 0.005  # of a robot in the standard deviation of a camera's clock, so that it locates the robot
 CERTAIN = 3.0  # standard deviations by which a correction may be wrong before a lag contradicts it: 1 in 700
+DECAY_S = 10.0  # of an offset that most corrections have in common: a fault of a clock adds 0.2 ms to it
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
 
 
@@ -47,6 +48,7 @@ class _Clock:
         correction_s, sigma_s: added to its stamps at `since_ns`, and the standard deviation.
         rate, rate_sigma: by which that grows, and the standard deviation.
         doubt_s: an offset that robots may show.
+        stepped_s: the part of the correction that the steps of its stamps show.
         since_ns, now_ns: the time of the last estimate, and of the last frame.
         reported_s: the correction that was last reported.
     """
@@ -57,6 +59,7 @@ class _Clock:
     rate: float = 0.0
     rate_sigma: float = 0.0
     doubt_s: float = 0.0
+    stepped_s: float = 0.0
     since_ns: int = 0
     now_ns: int = 0
     reported_s: float = 0.0
@@ -64,6 +67,11 @@ class _Clock:
     def at(self, t_ns: int) -> float:
         """The correction at a time, s."""
         return self.correction_s + self.rate * (t_ns - self.since_ns) * 1e-9
+
+    def unexplained_s(self, t_ns: int) -> float:
+        """The correction at a time, or what it is more than the steps of its stamps show: the smaller one."""
+        correction_s = self.at(t_ns)
+        return min(correction_s, correction_s - self.stepped_s, key=abs)
 
     @property
     def known_s(self) -> float:
@@ -74,7 +82,7 @@ class _Clock:
     @property
     def is_off(self) -> bool:
         """Whether the correction is more than its own uncertainty. A clock from which others departed has none of its
-        own: it takes a part of their rates (`hold_common_rate`)."""
+        own: it takes a part of their rates (`hold_common`)."""
         return abs(self.at(self.now_ns)) > CERTAIN * self.known_s > 0
 
     @property
@@ -96,6 +104,7 @@ class CameraClocks:
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._names, self._clocks = names, {name: _Clock(StampCheck()) for name in names}
+        self._held_ns = 0  # when no offset was held to be common
 
     def health(self) -> dict[str, ClockHealth]:
         """By camera."""
@@ -122,6 +131,7 @@ class CameraClocks:
         sigma_s, rate_sigma = 1e-9 * jump.sigma_ns, math.hypot(clock.rate, clock.rate_sigma)
         clock.sigma_s, clock.rate_sigma = math.hypot(clock.known_s, sigma_s), rate_sigma
         clock.correction_s, clock.since_ns = clock.at(frame.t_ns) - 1e-9 * jump.ahead_ns, frame.t_ns
+        clock.stepped_s -= 1e-9 * jump.ahead_ns
         if not jump.ahead_ns:
             return sigma_s, rate_sigma
         clock.reported_s, clock.rate = clock.correction_s, 0.0
@@ -173,15 +183,24 @@ class CameraClocks:
         for name, clock in self._clocks.items():
             clock.doubt_s = offsets_s.get(name, 0.0)
 
-    def hold_common_rate(self, t_ns: int) -> None:
-        """Let no rate be common to most clocks from a time on: robots show differences only, and each departure may
-        leave a part of its rate with the others, which would move all robots along their paths for ever."""
-        rates = [clock.rate for clock in self._clocks.values()]
-        # Of the medians the one nearest to none.
-        common = min(max(0.0, median_low(rates)), median_high(rates))
-        for clock in self._clocks.values() if common else ():
-            clock.correction_s, clock.since_ns = clock.at(t_ns), t_ns
-            clock.rate -= common
+    def hold_common(self, t_ns: int) -> None:
+        """Let no rate be common to most clocks from a time on, and let an offset that is decay: robots show differences
+        only, and each departure may leave a part of its offset and rate with the others, which would move all robots
+        along their paths for ever."""
+        if rate := _common([clock.rate for clock in self._clocks.values()]):
+            for clock in self._clocks.values():
+                clock.correction_s, clock.since_ns = clock.at(t_ns), t_ns
+                clock.rate -= rate
+        passed_s, self._held_ns = max(0, t_ns - (self._held_ns or t_ns)) * 1e-9, t_ns
+        offset_s = _common([clock.unexplained_s(t_ns) for clock in self._clocks.values()])
+        for clock in self._clocks.values() if offset_s else ():
+            clock.correction_s += offset_s * math.expm1(-passed_s / DECAY_S)
+            clock.since_ns = clock.since_ns or t_ns  # corrected from now on
+
+
+def _common(values: Sequence[float]) -> float:
+    """What most values have in common: of their medians the one nearest to none."""
+    return min(max(0.0, median_low(values)), median_high(values))
 
 
 def uncertain(frame_set: FrameSet, speed_m_s: float) -> set[str]:

@@ -73,7 +73,7 @@ class CameraMonitors:
         for departure in self.rig.take_departures():
             self.clocks.correct(departure)
         self.clocks.doubt(self.rig.clock_doubts)
-        self.clocks.hold_common_rate(frame_set.t_ns)
+        self.clocks.hold_common(frame_set.t_ns)
         for correction in corrections:
             if correction.placed:
                 self._cameras.place(correction.placed)

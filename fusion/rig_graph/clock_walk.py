@@ -22,6 +22,7 @@ RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crysta
 # Of an offset, s, and a rate that changed: cameras have stated rates that are 1 % wrong.
 CHANGED_SIGMA = 0.1, 1e-2
 RATE_WALK = 1e-4  # change of a rate in a second: a daemon that slews a clock changes it by 5e-4 at once
+SHORTEST_S = 0.1  # between two updates: that of two keyframes
 MEMORY_S = 10.0  # of errors of poses and lenses: what they do to offsets varies with the places of robots
 
 
@@ -52,10 +53,13 @@ class ClockWalk:
         offsets, rates: (C,) rows of these.
         departed: cameras whose clocks jumped or drifted, oldest first: they are not held to be right until they are
             known again, as well as a good clock. Else the last one would be the reference for ever, whatever it did.
+        is_suspicious: whether a clock may have departed, which the next keyframes decide.
     """
 
     def __init__(self, n_cameras: int) -> None:
         self._n, self._t_ns, self.departed = n_cameras, 0, list[int]()
+        self.is_suspicious = False
+        self._drift = np.zeros(n_cameras)  # rates that explain what the last keyframes show of the offsets
         self.rates = ERRORS * n_cameras + np.arange(n_cameras)
         self.offsets = ERRORS * np.arange(n_cameras) + CAUSES["clock"].start
         self.x = np.zeros((ERRORS + 1) * n_cameras)
@@ -104,11 +108,13 @@ class ClockWalk:
     def update(self, t_ns: int, H: Array, y: Array) -> bool:
         """Add keyframes: least squares H e = y, (8 C, 8 C) and (8 C,), about the cameras' errors at their mean time.
 
-        Keyframes that contradict the estimate beyond chance show that a clock changed, if that of one camera explains
-        them and the pose of none does as well. Else a camera moved, even if less than what `judge` finds: its pose must
-        not look like a clock. Then they are not used, and poses are forgotten; returns False.
+        They show that a clock changed if that explains more than chance, and more than any other clock and any pose
+        that is another one. Keyframes that contradict the estimate beyond chance otherwise show that a camera moved,
+        even if less than what `judge` finds: its pose must not look like a clock. Then they are not used, and poses are
+        forgotten; returns False.
         """
-        self._predict(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
+        interval_s = max(0, t_ns - (self._t_ns or t_ns)) * 1e-9
+        self._predict(interval_s)
         self._t_ns, seen = t_ns, slice(0, len(y))
         off, limit = y - H @ self.x[seen], chdtri(len(y), FALSE_ALARM)
         free = np.linalg.solve(H + np.diag(np.tile(FREE_SIGMA**-2, self._n)), off)
@@ -119,18 +125,22 @@ class ClockWalk:
             return float(off @ (free - with_them[seen, seen] @ off)), np.asarray(with_them, float)
 
         cost, P = explain(self.P)
-        if cost > limit:
-            cameras = range(self._n) if self._n > 2 else ()
-            changed = [(*explain(self._with_other_clock(k)), k) for k in cameras]
-            moved = min((explain(self._without_poses([k]))[0] for k in cameras), default=0.0)
-            cost, P, camera = min(changed, key=lambda c: c[0], default=(np.inf, P, 0))
-            if cost > limit or cost + chdtri(2, RIVAL) > moved:
-                self.forget_poses()
-                return False
+        cameras = range(self._n) if self._n > 2 else ()
+        changed = sorted((explain(self._with_other_clock(k))[0], k) for k in cameras)
+        moved = min((explain(self._without_poses([k]))[0] for k in cameras), default=np.inf)
+        (best, camera), (rival, _) = changed[:2] if changed else ((np.inf, 0), (np.inf, 0))
+        is_of_clock = best <= limit and best + chdtri(2, RIVAL) <= min(moved, rival)
+        if is_of_clock and cost - best > chdtri(2, FALSE_ALARM):
+            P = explain(self._with_other_clock(camera))[1]
             self._depart(camera)
             self._most[self.rates[camera]] = CHANGED_SIGMA[1]
+        elif cost > limit:
+            self.forget_poses()
+            return False
         self.P = (P + P.T) / 2
         self.x = self.x + self.P[:, seen] @ off
+        shown = free[self.offsets]
+        self._drift = np.abs(shown - np.median(shown)) / max(interval_s, SHORTEST_S)
         return True
 
     def _predict(self, dt: float) -> None:
@@ -164,19 +174,24 @@ class ClockWalk:
         known = explain(self.departed)[0]
         explained = sorted((explain([*self.departed, k])[0] - known, k) for k in others)
         (best, k), rival = explained[-1], explained[-2][0] if len(others) > 1 else 0.0
+        self.is_suspicious = len(others) > 1 and best > chdtri(2, RIVAL)
+        drift = np.zeros(self._n)  # of a clock that departs: it may go on as it did since the last update
         if len(others) > 1 and best > chdtri(2, FALSE_ALARM) and best - rival > chdtri(2, RIVAL):
             self._depart(k)
-            clock = of_clocks[k]
-            self.P[clock, clock] += explain(self.departed)[1][-1] ** 2
+            offset_s, rate = np.abs(explain(self.departed)[1][-1])
+            clock, drift[k] = of_clocks[k], self._drift[k]
+            self.P[clock, clock] += np.square([offset_s, max(rate, drift[k])])
         _, alone, sigma = explain(self.departed)
+        sigma[:, 1] = np.hypot(sigma[:, 1], drift[self.departed])
         self.x[of_clocks[self.departed]] -= alone
         departures = [
             Departure(k, self._t_ns, *a.tolist(), *b.tolist())
             for k, a, b in zip(self.departed, alone, sigma, strict=True)
         ]
-        others_now = [  # whose corrections stay, as well known as now
-            Departure(k, self._t_ns, 0.0, 0.0, *explain([k])[2][0].tolist())
+        others_now = [  # whose corrections stay, known no better than an offset that may be theirs
+            Departure(k, self._t_ns, 0.0, 0.0, *np.hypot(of_k[0], s_of_k[0]).tolist())
             for k in self._corrected.difference(self.departed)
+            for _, of_k, s_of_k in [explain([k])]
         ]
         if self._n > 2:  # of two, the one that departed before departs again
             self.departed = [

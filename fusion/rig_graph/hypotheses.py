@@ -425,10 +425,36 @@ def is_contradicted(none: Fit, n_cameras: int, variance: float) -> bool:
         variance: of whitened residuals, as of a model that explains all that errors of the cameras can: the residuals
             of `none` contain the fault.
     """
-    observed, gradient = none.reduced[:, :-1], none.reduced[:, -1]
-    score = gradient @ np.linalg.solve(observed + np.diag(np.tile(FREE_SIGMA**-2, n_cameras)), gradient)
+    score = _score(none.reduced)
     stretched = none.errors.ravel() @ none.prior @ none.errors.ravel()
     return bool(score + stretched > variance * chdtri(ERRORS * n_cameras, FALSE_ALARM))
+
+
+def has_changed(window: Window, found: Fit, keyframes: Mask) -> bool:
+    """Whether some keyframes (K,) alone show other errors of the cameras than all of them: the score test (Rao 1948)
+    of the errors by these, where a fit to all has its minimum."""
+    reduced = _reduced_by(window, found, keyframes)
+    return bool(_score(reduced) > found.variance * chdtri(len(reduced), FALSE_ALARM))
+
+
+def equations_by(window: Window, found: Fit, keyframes: Mask) -> tuple[Array, Array]:
+    """Least squares as of `Fit.equations` by some keyframes (K,) of a fit to all."""
+    return replace(found, reduced=_reduced_by(window, found, keyframes)).equations
+
+
+def _reduced_by(window: Window, found: Fit, keyframes: Mask) -> Array:
+    """Normal equations (8 C, 8 C + 1) by some keyframes (K,), where a fit to all has its minimum."""
+    shown, bodies = window.select(keyframes), keyframes[window.keyframe]
+    mine = bodies[window.observations.discs.body]
+    at = _Point(found.errors, found.bodies[bodies], found.places, found.rows[mine], found.squared[mine], 0.0)
+    return _eliminate(shown, _Priors.of(shown, found.hypothesis), at, 0.0)[0]
+
+
+def _score(reduced: Array) -> float:
+    """How much less the squares would be with other errors, by normal equations (8 C, 8 C + 1)."""
+    observed, gradient = reduced[:, :-1], reduced[:, -1]
+    free = np.diag(np.tile(FREE_SIGMA**-2, len(reduced) // ERRORS))
+    return float(gradient @ np.linalg.solve(observed + free, gradient))
 
 
 def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()) -> Verdict:

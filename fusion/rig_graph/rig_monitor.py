@@ -11,6 +11,7 @@ look wrong.
 """
 
 import logging
+import math
 import os
 import signal
 import threading
@@ -46,7 +47,9 @@ from fusion.rig_graph.hypotheses import (
     Hypothesis,
     Verdict,
     Window,
+    equations_by,
     fit,
+    has_changed,
     judge,
     retract,
     several_markers,
@@ -59,8 +62,6 @@ log = logging.getLogger("fusion")
 P = ParamSpec("P")
 T = TypeVar("T")
 Equations = tuple[int, Array, Array]  # Unix time in ns, and H (8 C, 8 C) and y (8 C,) of `ClockWalk.update`
-Measured = tuple[Equations, dict[int, Shape]]  # and by row of the robots
-Judgement = tuple[Window, Verdict, Measured | None]
 NICENESS = 10  # of the process that judges: poses and detections come first
 # Keyframes that are judged: the more, the better they determine a camera; the fewer, the sooner all of them are new.
 WINDOWS = 24, 12, 6
@@ -83,6 +84,24 @@ MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be
 FALL, AGREED_FALL = 0.5**0.125, 0.5
 REMEMBERED_NS = 4_000_000_000  # moments; a camera is judged within three seconds
 MAX_KNOWN = 4  # poses of a camera, to which it may return
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What the keyframes of a window show that were not measured before.
+
+    Attributes:
+        errors: of the cameras, by all of them.
+        clocks: the same by a few keyframes after the other, because clocks drift meanwhile.
+        shapes: by row of the robots.
+    """
+
+    errors: Equations
+    clocks: tuple[Equations, ...]
+    shapes: dict[int, Shape]
+
+
+Judgement = tuple[Window, Verdict, Measured | None]
 
 
 class RigMonitor:
@@ -268,8 +287,14 @@ class RigMonitor:
     def _judge(self, now_ns: int, usual_cost: float) -> None:
         """Judge the keyframes if it is time."""
         kept = tuple(self._keyframes.kept)
-        has_changed = self._was_doubtful or bool(self._walk.departed) or usual_cost > GREW * self._judged_cost
-        pause_ns = CHECK_NS if has_changed else max(CHECK_NS, self._pause_ns)
+        is_urgent = (
+            self._was_doubtful
+            or bool(self._walk.departed)
+            or self._walk.is_suspicious
+            or self._cameras.error_scale > self._scale  # claims grew, and nothing explains why
+            or usual_cost > GREW * self._judged_cost
+        )
+        pause_ns = CHECK_NS if is_urgent else max(CHECK_NS, self._pause_ns)
         wait_ns = SUSPICIOUS_NS if self.is_doubtful else pause_ns
         if self._job is not None or len(kept) < min(WINDOWS) or now_ns < self._checked_ns + wait_ns:
             return
@@ -342,7 +367,7 @@ class RigMonitor:
         if verdict.cause == "focal":
             for k in verdict.cameras:
                 refinement.free_lens(k)
-        refinement.update(*measured[0])
+        refinement.update(*measured.errors)
         self._measured_ns = self._given_ns
         if not refinement.is_significant:
             return None
@@ -415,7 +440,7 @@ class RigMonitor:
         if measured is None:
             return
         self._measured_ns = self._given_ns
-        if self._walk.update(*measured[0]):
+        if [self._walk.update(*equations) for equations in measured.clocks][-1]:
             self._departures = self._walk.take_departures()
             self.clock_doubts.clear()
 
@@ -426,7 +451,7 @@ class RigMonitor:
         if measured is None or not self.refines or self.excluded or not is_of_robots:
             return
         self._measured_ns = self._given_ns
-        if self._shapes.use(measured[1]):
+        if self._shapes.use(measured.shapes):
             self._has_placed = True
             self._forget()
 
@@ -575,6 +600,9 @@ def judge_latest(
         if n <= len(keyframes):
             window, starts = window_of(keyframes[-n:], array, markers)
             verdict = judge(window, starts, [array.index[name] for name in moved])
+            newest = np.arange(n) >= n - min(WINDOWS)
+            if n > min(WINDOWS) and has_changed(window, verdict.fit, newest):
+                continue
             if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict, _measure(window, verdict, keyframes[-n:], shapes, since_ns)
     return None
@@ -672,9 +700,16 @@ def _measure(
     if not len(shown.camera):
         return None
     found = fit(shown, replace(verdict.fit.hypothesis, robots=several_markers(shown)))
-    equations = int(times[is_new].mean()), *found.equations
     markers = {robot: np.flatnonzero(window.owner == robot) for robot in found.hypothesis.robots}
-    return equations, shapes.learned({r: found.equations_of_places(rows) for r, rows in markers.items()})
+    n = np.count_nonzero(is_new)
+    n_parts = math.ceil(n / min(WINDOWS))
+    number = (np.cumsum(is_new) - 1) * n_parts // n
+    parts = [is_new & (number == part) for part in range(n_parts)]
+    return Measured(
+        (round(times[is_new].mean()), *found.equations),
+        tuple((round(times[part].mean()), *equations_by(shown, found, part)) for part in parts),
+        shapes.learned({r: found.equations_of_places(rows) for r, rows in markers.items()}),
+    )
 
 
 def _seeing(window: Window) -> list[str]:

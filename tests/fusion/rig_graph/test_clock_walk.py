@@ -4,6 +4,9 @@
 import numpy as np
 import pytest
 
+from camera_node.detection.roundels import Roundels
+from fusion.model.frames import CalibratedFrame
+from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.rig_graph.clock_walk import OFFSET_SIGMA_S, ClockWalk, Departure
 from fusion.rig_graph.hypotheses import CAUSES, ERRORS, FREE_SIGMA
 
@@ -49,23 +52,52 @@ def test_good_clocks_are_left_alone(n_cameras: int):
     assert not any(first_departure([0.0] * n_cameras, seed) for seed in range(20))
 
 
+def correction_s(clocks: CameraClocks, name: str, t_ns: int) -> float:
+    """Of a frame that arrives a second later."""
+    frame = CalibratedFrame(
+        name, t_ns, Roundels.from_points(np.empty((0, 2)), 0.3), np.zeros((19, 0)), received_ns=t_ns + 10**9
+    )
+    admitted = clocks.admit(frame)
+    assert admitted is not None
+    return 1e-9 * (admitted.t_ns - t_ns)
+
+
 def test_the_last_clock_that_did_not_jump_is_no_reference_for_ever():
     """All others jumped once, and it drifts later: they were corrected to follow it, and all robots with them."""
-    rng, n, walk, corrected = np.random.default_rng(2), 4, ClockWalk(4), np.zeros(4)
-    corrections = [Departure(k, START_NS, 0.0, 0.0, 0.0, 0.0) for k in range(n)]
+    rng, names, corrected = np.random.default_rng(2), ("cam0", "cam1", "cam2", "cam3"), np.zeros(4)
+    walk, clocks = ClockWalk(4), CameraClocks(names)
     for step in range(160):
         t_ns = START_NS + step * 500_000_000
         if step in (10, 20, 30):
             walk.jump(step // 10, 1e-3, 0.0)
         offsets = np.array([5e-4 * max(0.0, 0.5 * step - 40.0), 0.0, 0.0, 0.0])
-        corrected = offsets - [c.at(t_ns) for c in corrections]
-        walk.update(t_ns, *about_offsets(corrected + SIGMA_S * rng.normal(size=n)))
+        corrected = offsets - [correction_s(clocks, name, t_ns) for name in names]
+        walk.update(t_ns, *about_offsets(corrected + SIGMA_S * rng.normal(size=4)))
         for found in walk.take_departures():
-            old = corrections[found.camera]
-            corrections[found.camera] = Departure(
-                found.camera, t_ns, old.at(t_ns) + found.offset_s, old.rate + found.rate, 0.0, 0.0
-            )
+            clocks.correct(found)
+        clocks.hold_common(t_ns)
     assert np.abs(corrected).max() < 1e-3  # without a correction 20 ms
+
+
+@pytest.mark.parametrize("ppm", [200.0, 1000.0, -5000.0])
+def test_a_drift_that_begins_is_claimed_before_its_rate_is_known(ppm: float):
+    """Its first departure shows an offset, which may grow as fast as it arose: with the rate claimed to 130 ppm, poses
+    were 12 standard deviations off."""
+    deviations, window_s = [], 0.6
+    for seed in range(20):
+        rng, walk, begun = np.random.default_rng(seed), ClockWalk(4), 12.0 - seed / 20
+        found, drift_s, k = (), 0.0, 0
+        while not found:
+            drift_s = ppm * 1e-6 * window_s * max(0.0, k - begun)
+            t_ns = START_NS + round(k * window_s * 1e9)
+            shown = np.array([0.0, drift_s, 0.0, 0.0]) + SIGMA_S * rng.normal(size=4)
+            walk.update(t_ns, *about_offsets(shown))
+            found, k = walk.take_departures(), k + 1
+            assert k < 40
+        assert found[0].camera == 1
+        error_s = found[0].at(found[0].t_ns + round(window_s * 1e9)) - drift_s - ppm * 1e-6 * window_s
+        deviations.append(error_s / np.hypot(found[0].sigma_s, found[0].rate_sigma * window_s))
+    assert np.mean(np.square(deviations)) < 2.3  # chi-square with 20 degrees of freedom, one in a thousand
 
 
 def test_two_clocks_do_not_show_which_one_departs():
