@@ -7,7 +7,7 @@ estimate, by a margin over every other one: a generalized likelihood ratio, as i
 docs/design/time_offsets.md has the equations.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,12 +125,16 @@ class ClockWalk:
             return float(off @ (free - with_them[seen, seen] @ off)), np.asarray(with_them, float)
 
         cost, P = explain(self.P)
-        cameras = range(self._n) if self._n > 2 else ()
-        changed = sorted((explain(self._with_other_clock(k))[0], k) for k in cameras)
-        moved = min((explain(self._without_poses([k]))[0] for k in cameras), default=np.inf)
-        (best, camera), (rival, _) = changed[:2] if changed else ((np.inf, 0), (np.inf, 0))
-        is_of_clock = best <= limit and best + chdtri(2, RIVAL) <= min(moved, rival)
-        if is_of_clock and cost - best > chdtri(2, FALSE_ALARM):
+        # What another offset of one clock alone explains: a rank-one change of the covariance.
+        with_window = np.eye(len(y)) + H @ self.P[seen, seen]
+        score, information = np.linalg.solve(with_window, off), np.linalg.solve(with_window, H)
+        gain = score[self.offsets] ** 2 / (np.diag(information)[self.offsets] + CHANGED_SIGMA[0] ** -2)
+        camera = int(np.argmax(gain))
+        if (
+            self._n > 2
+            and gain[camera] > chdtri(2, FALSE_ALARM)
+            and self._is_of_clock(cost - gain, limit, explain)
+        ):
             P = explain(self._with_other_clock(camera))[1]
             self._depart(camera)
             self._most[self.rates[camera]] = CHANGED_SIGMA[1]
@@ -142,6 +146,15 @@ class ClockWalk:
         shown = free[self.offsets]
         self._drift = np.abs(shown - np.median(shown)) / max(interval_s, SHORTEST_S)
         return True
+
+    def _is_of_clock(
+        self, costs: Array, limit: float, explain: Callable[[Array], tuple[float, Array]]
+    ) -> bool:
+        """Whether the clock that leaves the lowest of `costs` (C,) explains keyframes, and neither the second best nor
+        another pose of a camera does as well."""
+        best, rival = np.partition(costs, 1)[:2]
+        moved = min(explain(self._without_poses([k]))[0] for k in range(self._n))
+        return bool(best <= limit and best + chdtri(2, RIVAL) <= min(rival, moved))
 
     def _predict(self, dt: float) -> None:
         F, Q = np.eye(len(self.x)), np.zeros_like(self.P)

@@ -92,7 +92,7 @@ class Measured:
 
     Attributes:
         errors: of the cameras, by all of them.
-        clocks: the same by a few keyframes after the other, because clocks drift meanwhile.
+        clocks: the same by at most six successive keyframes each, because clocks drift.
         shapes: by row of the robots.
     """
 
@@ -440,7 +440,10 @@ class RigMonitor:
         if measured is None:
             return
         self._measured_ns = self._given_ns
-        if [self._walk.update(*equations) for equations in measured.clocks][-1]:
+        is_used = False
+        for equations in measured.clocks:
+            is_used = self._walk.update(*equations)
+        if is_used:
             self._departures = self._walk.take_departures()
             self.clock_doubts.clear()
 
@@ -601,9 +604,8 @@ def judge_latest(
             window, starts = window_of(keyframes[-n:], array, markers)
             verdict = judge(window, starts, [array.index[name] for name in moved])
             newest = np.arange(n) >= n - min(WINDOWS)
-            if n > min(WINDOWS) and has_changed(window, verdict.fit, newest):
-                continue
-            if verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
+            is_constant = newest.all() or not has_changed(window, verdict.fit, newest)
+            if is_constant and verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict, _measure(window, verdict, keyframes[-n:], shapes, since_ns)
     return None
 

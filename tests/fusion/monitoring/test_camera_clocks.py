@@ -177,6 +177,19 @@ def corrections_s(clocks: CameraClocks) -> list[float]:
     return [1e-9 * (now.t_ns - frame.t_ns) for now, frame in admitted if now is not None]
 
 
+def test_a_clock_in_doubt_is_uncertain_by_the_offset_that_it_may_have():
+    clocks = CameraClocks(tuple(LOAD.rig))
+    clocks.doubt({"cam2": 0.012})
+    frames = [replace(f, received_ns=f.t_ns) for f in LOAD.frames(1 / LOAD.hz)]
+    admitted = [clocks.admit(frame) for frame in frames]
+    assert {f.camera: f.clock_sigma_s for f in admitted if f is not None and f.clock_sigma_s} == {
+        "cam2": 0.012
+    }
+    assert clocks.health()["cam2"].state == "uncertain"
+    clocks.doubt({})
+    assert clocks.health()["cam2"].state == "correct"
+
+
 def test_a_clock_from_which_the_others_departed_is_not_named(caplog):
     """After a jump of three of four, 348 ppm that their offsets left, which were known to 300 ppm, were reported as the
     drift of the fourth. One that departs by more than is uncertain is named."""

@@ -3,12 +3,13 @@
 
 import numpy as np
 import pytest
+from scipy.special import chdtri
 
 from camera_node.detection.roundels import Roundels
 from fusion.model.frames import CalibratedFrame
 from fusion.monitoring.camera_clocks import CameraClocks
 from fusion.rig_graph.clock_walk import OFFSET_SIGMA_S, ClockWalk, Departure
-from fusion.rig_graph.hypotheses import CAUSES, ERRORS, FREE_SIGMA
+from fusion.rig_graph.hypotheses import CAUSES, ERRORS, FALSE_ALARM, FREE_SIGMA
 
 WINDOW_S, SIGMA_S = 2.4, 1e-4  # between windows, and of an offset in one
 START_NS = 10**18
@@ -98,6 +99,37 @@ def test_a_drift_that_begins_is_claimed_before_its_rate_is_known(ppm: float):
         error_s = found[0].at(found[0].t_ns + round(window_s * 1e9)) - drift_s - ppm * 1e-6 * window_s
         deviations.append(error_s / np.hypot(found[0].sigma_s, found[0].rate_sigma * window_s))
     assert np.mean(np.square(deviations)) < 2.3  # chi-square with 20 degrees of freedom, one in a thousand
+
+
+def settled(n_cameras: int, *jumped: int) -> tuple[ClockWalk, int]:
+    """Clocks that 20 windows without noise show to be right, and the time of the next one."""
+    walk, window_ns = ClockWalk(n_cameras), 600_000_000
+    for k in jumped:
+        walk.jump(k, 1e-3, 0.0)
+    for k in range(20):
+        walk.update(START_NS + k * window_ns, *about_offsets(np.zeros(n_cameras)))
+        walk.take_departures()
+    assert not walk.departed
+    return walk, START_NS + 20 * window_ns
+
+
+def test_one_clock_changed_although_all_errors_together_are_within_chance():
+    walk, next_ns = settled(4)
+    offsets = np.array([0.0, 1.3e-3, 0.0, 0.0])
+    H, y = about_offsets(offsets)
+    explained = y @ np.linalg.solve(H + np.linalg.inv(walk.P[: len(y), : len(y)]), y)
+    contradiction = offsets @ y[walk.offsets] - explained
+    assert contradiction < chdtri(len(y), FALSE_ALARM)
+    assert walk.update(next_ns, H, y)
+    assert walk.departed == [1]
+
+
+def test_an_offset_that_is_not_significant_is_claimed_and_not_corrected():
+    walk, next_ns = settled(4, 2)
+    walk.update(next_ns, *about_offsets(np.array([0.0, 0.0, 4e-4, 0.0])))
+    (found,) = (d for d in walk.take_departures() if d.camera == 2)
+    assert found.offset_s == 0.0
+    assert found.sigma_s > 2e-4
 
 
 def test_two_clocks_do_not_show_which_one_departs():

@@ -15,12 +15,14 @@ from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame
 from fusion.model.states import POSITION
+from fusion.rig_graph.hypotheses import CAUSES, Verdict
 from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.trust import Case, run
 from tests.fusion.clock_faults import ERROR_M, SIGMAS
 from tests.fusion.moved_camera import MOTIONS, MOVE_S, ROBOTS, black, moved
+from tests.fusion.rig_graph.fits import fitted
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, ring
 from tests.fusion.tracks import errors
 
@@ -249,6 +251,15 @@ def follow(tracker: Tracker, frames: list[CalibratedFrame]) -> tuple[list[Extrin
             states = [pose.state for pose in tracker.track(frame_set).poses]
             corrections += tracker.check_extrinsics(frame_set)
     return corrections, states
+
+
+def test_a_clock_that_a_judgement_blames_is_in_doubt_until_others_confirm_it():
+    arena = Arena(ROBOTS, MOTIONS)
+    tracker, n = Tracker(arena.cameras, ROBOTS), len(arena.cameras)
+    monitors, fit = tracker.monitors, fitted("clock", (1,), n, 0.0)
+    fit.errors[1, CAUSES["clock"]] = 0.012
+    monitors.rig._note_clocks(Verdict("clock", (1,), fit), None)
+    assert monitors.rig.clock_doubts == {tracker.cameras.names[1]: 0.012}
 
 
 def test_a_process_that_judges_is_started_again_after_it_was_killed():

@@ -101,11 +101,11 @@ def _has_changed(arena: VirtualArena) -> bool:
     """Whether the newest quarter of the keyframes shows other errors of the cameras than all of them."""
     tracker = arena.server.pipeline.tracker
     assert tracker is not None
-    kept = tuple(tracker.monitors.rig._keyframes.kept)
-    window, _ = window_of(kept, tracker.cameras, tracker.table.markers)
+    keyframes = tuple(tracker.monitors.rig._keyframes.kept)
+    window, _ = window_of(keyframes, tracker.cameras, tracker.table.markers)
     found = fit(window, Hypothesis.of(None, (), len(window.names)))
     assert found.is_adequate()
-    return has_changed(window, found, np.arange(len(kept)) >= len(kept) - min(WINDOWS))
+    return has_changed(window, found, np.arange(len(keyframes)) >= len(keyframes) - min(WINDOWS))
 
 
 def _happens(arena: VirtualArena, within_s: float, has_happened: Callable[[], bool]) -> bool:
