@@ -46,8 +46,8 @@ class FrameSynchronizer:
     """Closes a frame set when every live camera has delivered its frame, or when the wait limit is reached.
 
     Frame sets have a constant period. Their phase is that of the first camera by name, whose frames are in the middle
-    of their sets. A frame that missed its set is used in the next one at its own time, unless it is older than that by
-    more than `lateness_ns`: then it is dropped and counted.
+    of their sets. A frame that missed its set is used in the next one at its own time; an older one is dropped and
+    counted: by then accelerations, which nobody predicts, have moved robots by more than it would correct.
 
     Args:
         period_ns: of the frame sets; without it that of the fastest camera, estimated from its first frames. A camera
@@ -127,7 +127,7 @@ class FrameSynchronizer:
         """Frames with earlier capture times are too late."""
         if self._end_ns is None or not self.period_ns:
             return 0
-        return self._end_ns - self.period_ns - self.lateness_ns
+        return self._end_ns - 2 * self.period_ns
 
     def _try_start(self, now_ns: int) -> bool:
         """Start the sequence of frame sets once the rate is known."""

@@ -172,8 +172,12 @@ class ServerStatistics:
         now_ns = camera.last_ns
         if not is_on_time:
             if not camera.late_since_ns:
-                late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
-                log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
+                if age_ms > limit_ms:
+                    late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
+                    log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
+                else:
+                    late = "%s: a frame came after later ones, %.0f ms old; such frames are dropped"
+                    log.warning(late, name, age_ms, extra=self._about(name))
                 camera.late_since_ns, camera.late_before = now_ns, camera.late
             camera.late, camera.late_ns = camera.late + 1, now_ns
             with self._lock:

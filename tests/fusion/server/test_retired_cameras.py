@@ -44,3 +44,12 @@ def test_a_camera_that_is_late_now_and_then_is_told_twice(caplog: pytest.LogCapt
     ]
     statistics.note_lateness("cam0", False, 390.0)
     assert "390 ms late" in caplog.records[-1].getMessage()
+
+
+def test_frames_that_come_after_later_ones_are_not_said_to_exceed_the_limit(caplog: pytest.LogCaptureFixture):
+    statistics = ServerStatistics(150.0)
+    statistics.count_arrival("cam0", 10**9, 10**9)
+    statistics.note_lateness("cam0", False, 60.0)
+    assert caplog.records[-1].getMessage() == (
+        "cam0: a frame came after later ones, 60 ms old; such frames are dropped"
+    )

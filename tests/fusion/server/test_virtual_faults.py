@@ -125,3 +125,20 @@ def test_false_roundels_of_one_camera_blame_no_marker(tmp_path: Path):
         lines = [line for _, line in arena.new_lines()]
     assert any("roundels" in line and "cam1" in line for line in lines)
     assert not [line for line in lines if "markers" in line]
+
+
+@pytest.mark.ci
+def test_a_camera_whose_frames_come_late_did_not_move(tmp_path: Path):
+    """Frames that missed their set by 0.1 s were used in a later one, though robots had accelerated since. Their camera
+    was excluded as moved, and used again 30 mm from its place: poses were wrong by 28 mm."""
+    with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
+        arena.wait(5.0)
+        tracker = arena.server.pipeline.tracker
+        assert tracker is not None
+        poses = {name: tracker.cameras[name].T_world_cam for name in arena.cameras}
+        arena.place("cam2", CameraFault(delay_ms=300.0, since_ns=arena.clock.now_ns()))
+        arena.wait(4.0)
+        assert arena.server.pipeline.synchronizer.late["cam2"] > 60  # of 120
+        assert not tracker.monitors.rig.excluded
+        assert {name: tracker.cameras[name].T_world_cam for name in arena.cameras} == poses
+        assert arena.judge.wrong == []
