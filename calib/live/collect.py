@@ -40,7 +40,7 @@ class CollectedFrames:
         last_seen_s: time of the last message, by camera.
         moved_s: when a roundel was last seen to move; None before.
         invalid: number of messages that could not be decoded.
-        publishers: whose frames count where two nodes publish under one name.
+        publishers: which frames count where two nodes publish under one name, or one sends a frame twice.
     """
 
     messages: list[Detections] = field(default_factory=list)
@@ -63,7 +63,7 @@ class CollectedFrames:
         except MessageError:
             self.invalid += 1
             return
-        if not self.publishers.admits(message, round(now_s * 1e9)):
+        if not self.publishers.admits(message, round(now_s * 1e9)) or self.publishers.is_repeated(message):
             return
         self.messages.append(message)
         self.last_seen_s[message.camera] = now_s

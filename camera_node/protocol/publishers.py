@@ -1,21 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Decides whose frames count where several nodes publish under one camera's name."""
+"""Decides which frames count where several nodes publish under one camera's name, or one sends a frame twice."""
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 
 from camera_node.protocol.messages import Detections
 
 HANDOVER_NS = 1_000_000_000  # after the last frame of a name's owner, the name passes to another node
+HISTORY = 64  # frames of a camera
+# Two stamps of one frame. A node adds the error of its clock by its newest estimate: of frames that a driver delivered
+# twice, the stamps differ by nanoseconds. No camera exposes 10,000 times a second.
+SAME_NS = 100_000
 
 
 @dataclass(slots=True)
 class _Owner:
-    """The node whose frames count, and when its last frame and the last refused one arrived."""
+    """The node whose frames count, when its last frame and the last refused one arrived, and its last stamps."""
 
     publisher: int
     last_ns: int
     refused_ns: int | None = None
     is_contested: bool = False
+    stamps: deque[int] = field(default_factory=lambda: deque(maxlen=HISTORY))
 
 
 class Publishers:
@@ -38,7 +44,8 @@ class Publishers:
         if owner is None or (
             owner.publisher != message.publisher and abs(received_ns - owner.last_ns) > HANDOVER_NS
         ):
-            self._owners[message.camera] = _Owner(message.publisher, received_ns)
+            stamps = deque[int](maxlen=HISTORY) if owner is None else owner.stamps
+            self._owners[message.camera] = _Owner(message.publisher, received_ns, stamps=stamps)
             return True
         if owner.publisher != message.publisher:
             owner.refused_ns = received_ns
@@ -48,6 +55,14 @@ class Publishers:
             owner.refused_ns is not None and abs(received_ns - owner.refused_ns) <= HANDOVER_NS
         )
         return True
+
+    def is_repeated(self, message: Detections) -> bool:
+        """Whether an admitted frame came before; if not, its stamp is remembered."""
+        stamps = self._owners[message.camera].stamps
+        if any(abs(message.t_ns - t_ns) < SAME_NS for t_ns in stamps):
+            return True
+        stamps.append(message.t_ns)
+        return False
 
     def is_contested(self, camera: str) -> bool:
         """Whether the owner sent a frame after one of another node: that is no successor, but a second node."""

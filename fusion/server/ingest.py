@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.rig.camera import Camera
 from camera_node.protocol.messages import Detections, Keys, MessageError, decode
-from camera_node.protocol.publishers import Publishers
+from camera_node.protocol.publishers import HISTORY, Publishers
 from fusion.model.frames import CalibratedFrame
 from fusion.server.server_statistics import ServerStatistics
 
@@ -25,7 +25,6 @@ MAX_UNCALIBRATED = 64  # cameras that the rig does not contain: more names are a
 MAX_BYTES = 1 << 19  # of a message; one with the most roundels has 240 kB
 # Used of one frame: all markers of 200 robots; the others come from a texture or a fault.
 MAX_DETECTIONS = 1024
-HISTORY = 64  # frames of a camera
 # Of sequence numbers in the history, for two publishers that do not say who they are: a restarted node makes one.
 MIN_STEPS_BACK = 4
 ANOTHER_NODE = "frames of another node under its name"
@@ -63,9 +62,8 @@ def refusal(message: Detections, cameras: Mapping[str, Camera]) -> Refusal | Non
 
 @dataclass(slots=True)
 class _FrameHistory:
-    """The last frames of a camera: their times, and whether each sequence number was not above the previous one."""
+    """Whether each sequence number of the last frames of a camera was not above the previous one."""
 
-    times: deque[int] = field(default_factory=lambda: deque(maxlen=HISTORY))
     steps_back: deque[bool] = field(default_factory=lambda: deque(maxlen=HISTORY))
     seq: int = -1
 
@@ -107,8 +105,9 @@ class Ingest:
         self._statistics.count_arrival(name, message.t_ns, received_ns)
         if refused is not None:
             return self._refuse(refused, name) if cameras else None
-        if not self._is_new(message):
+        if self._publishers.is_repeated(message):
             return self._refuse("duplicate frame", name)
+        self._note_sequence(message)
         if len(message) > MAX_DETECTIONS:
             self._statistics.count_fault("frames with too many roundels", name)
         admitted = admit(message, cameras, received_ns)
@@ -143,20 +142,14 @@ class Ingest:
             self._uncalibrated.add(name)
         return True
 
-    def _is_new(self, message: Detections) -> bool:
-        """Whether the frame is no duplicate. Two publishers of one name are reported.
-
-        Where nodes do not say who they are, sequence numbers that alternate show them.
-        """
+    def _note_sequence(self, message: Detections) -> None:
+        """Report two publishers of one name: where nodes do not say who they are, sequence numbers that alternate show
+        them."""
         history = self._histories.setdefault(message.camera, _FrameHistory())
-        if message.t_ns in history.times:
-            return False
-        history.times.append(message.t_ns)
         history.steps_back.append(message.seq <= history.seq)
         history.seq = message.seq
         has_two = self._publishers.is_contested(message.camera) or sum(history.steps_back) >= MIN_STEPS_BACK
         self._statistics.note_publishers(message.camera, has_two)
-        return True
 
 
 def _with_strongest(frame: CalibratedFrame) -> CalibratedFrame:

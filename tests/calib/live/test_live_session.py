@@ -113,6 +113,15 @@ def waved(seconds: float, at_s: float) -> CollectedFrames:
     return collected
 
 
+def test_frames_that_a_driver_delivers_twice_count_once():
+    """Their stamps differ by nanoseconds, by what the node learned of its clock in between."""
+    collected, messages = CollectedFrames(), record(ring(2), 1.0)
+    for message in messages:
+        for later_ns in (0, 20):
+            collected.add(encode(msgspec.structs.replace(message, t_ns=message.t_ns + later_ns)), 1.0)
+    assert collected.messages == messages
+
+
 def test_a_session_without_a_wand_ends_once_the_cameras_are_placed():
     """Roundels that do not move are no wand. Before the first motion there is nothing to end."""
     collected, still = waved(3.0, at_s=5.0), CollectedFrames()
