@@ -16,13 +16,13 @@ from scipy.special import chdtri
 from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index
 from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, RIVAL
+from fusion.rig_graph.keyframes import INTERVAL_NS
 
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock
 RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crystals have 1e-4, bad drivers more
 # Of an offset, s, and a rate that changed: cameras have stated rates that are 1 % wrong.
 CHANGED_SIGMA = 0.1, 1e-2
 RATE_WALK = 1e-4  # change of a rate in a second: a daemon that slews a clock changes it by 5e-4 at once
-SHORTEST_S = 0.1  # between two updates: that of two keyframes
 MEMORY_S = 10.0  # of errors of poses and lenses: what they do to offsets varies with the places of robots
 
 
@@ -144,7 +144,7 @@ class ClockWalk:
         self.P = (P + P.T) / 2
         self.x = self.x + self.P[:, seen] @ off
         shown = free[self.offsets]
-        self._drift = np.abs(shown - np.median(shown)) / max(interval_s, SHORTEST_S)
+        self._drift = np.abs(shown - np.median(shown)) / max(interval_s, 1e-9 * INTERVAL_NS)
         return True
 
     def _is_of_clock(

@@ -546,6 +546,7 @@ class RigMonitor:
         self._cameras.count_errors(1.0, 0.0)
         self._doubted.clear()
         self._clocks.clear()
+        self.clock_doubts.clear()
         self._moments.clear()
         self._note_undecided(())
 
