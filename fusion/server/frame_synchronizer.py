@@ -5,10 +5,11 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
+from statistics import median_low
 
 from fusion.model.frames import CalibratedFrame, FrameSet
 
-RATE_FRAMES = 8  # of one camera, from which its rate is estimated
+RATE_FRAMES = 8  # of one camera, from which its rate and its usual lag are estimated
 DEFAULT_PERIOD_NS = 33_333_333  # where no camera sent two frames
 MAX_RATE_HZ = 240.0  # of frame sets, where the cameras' rates decide
 FAR_FASTER = 2.5  # times the median rate of the cameras: a camera beyond does not decide the rate
@@ -23,9 +24,10 @@ INTERVAL_SLACK = 1.1  # a frame is missing once its camera is this many interval
 
 @dataclass(slots=True)
 class _CameraRate:
-    """The recent capture times of a camera."""
+    """The recent capture times of a camera, and how long after these its frames arrived."""
 
     times: deque[int] = field(default_factory=lambda: deque(maxlen=RATE_FRAMES))
+    lags: deque[int] = field(default_factory=lambda: deque(maxlen=RATE_FRAMES))
     late: int = 0
     interval_ns: int = 0  # median; 0 while it is unknown
 
@@ -52,7 +54,8 @@ class FrameSynchronizer:
     Args:
         period_ns: of the frame sets; without it that of the fastest camera, estimated from its first frames. A camera
             far faster than the median one does not count, and the rate is at most `MAX_RATE_HZ`.
-        lateness_ns: the wait limit.
+        lateness_ns: the wait limit, from when the set's frames of the fastest camera usually arrive: all cameras may
+            be network streams of 0.3 s.
     """
 
     def __init__(self, period_ns: int | None = None, lateness_ns: int = 150_000_000) -> None:
@@ -81,9 +84,17 @@ class FrameSynchronizer:
         """Frames dropped since the start, by camera."""
         return {name: camera.late for name, camera in self._cameras.items()}
 
+    @property
+    def limit_ns(self) -> int:
+        """How long after its capture a frame set waits for a frame: `lateness_ns` more than the frames of the camera
+        with the least lag usually take."""
+        lags = [median_low(camera.lags) for camera in self._cameras.values() if self._is_live(camera)]
+        return self.lateness_ns + max(0, min(lags, default=0))
+
     def add(self, frame: CalibratedFrame) -> bool:
         """Add a frame; return False if it is too late."""
         camera = self._cameras.setdefault(frame.camera, _CameraRate())
+        camera.lags.append(frame.received_ns - frame.t_ns if frame.received_ns else 0)
         if frame.t_ns < self._oldest_ns():
             camera.late += 1
             return False
@@ -213,7 +224,9 @@ class FrameSynchronizer:
         """Whether the wait limit is reached, or all live cameras have delivered to a set that has begun."""
         has_begun = self.period_ns is not None and now_ns >= end_ns - self.period_ns
         is_complete = has_begun and any(self._is_live(c) for c in self._cameras.values())
-        return (is_complete and not self._count_missing(end_ns)) or now_ns >= end_ns + self.lateness_ns
+        if is_complete and not self._count_missing(end_ns):
+            return True
+        return now_ns >= end_ns + self.lateness_ns and now_ns >= end_ns + self.limit_ns
 
     def _note(self, name: str, camera: _CameraRate) -> None:
         """Note whether a camera is missing in the open set, after its times changed."""

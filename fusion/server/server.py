@@ -82,7 +82,7 @@ class Server:
         self.config = config
         self.keys = Keys(config.arena)
         self.endpoints = config.listen
-        self.statistics = ServerStatistics(config.limits.lateness_ms)
+        self.statistics = ServerStatistics()
         with contextlib.ExitStack() as stack:
             for folder in config.saving_folders() if config.leads else ():
                 stack.enter_context(locked_folder(folder, "server"))
@@ -339,8 +339,12 @@ class Server:
                 self.statistics.count_refusal("implausible time", name)
             return
         age_ns = received_ns - frame.t_ns  # of all cameras on a slow link, which none outruns
-        is_on_time = age_ns <= self._max_lag_ns and self.pipeline.synchronizer.add(frame)
-        self.statistics.note_lateness(name, is_on_time, age_ns * 1e-6)
+        synchronizer = self.pipeline.synchronizer
+        if age_ns <= self._max_lag_ns and synchronizer.add(frame):
+            self.statistics.note_on_time(name)
+        else:
+            limit_ns = min(self._max_lag_ns, synchronizer.limit_ns)
+            self.statistics.note_late(name, age_ns * 1e-6, limit_ns * 1e-6)
 
     def _follow_rig(self, data: bytes, key: str, received_ns: int) -> None:
         """Use the rig of the first zone's server."""

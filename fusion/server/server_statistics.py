@@ -91,13 +91,9 @@ class ServerStatistics:
     """Counts what the server receives and computes.
 
     `count_fault` and `count_refusal` are callable from any thread, the rest from one.
-
-    Args:
-        lateness_limit_ms: how long a frame set waits for frames, for the log.
     """
 
-    def __init__(self, lateness_limit_ms: float) -> None:
-        self._lateness_limit_ms = lateness_limit_ms
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._faults: Counter[str] = Counter()
         self._cameras: dict[str, _CameraCounts] = {}
@@ -163,26 +159,34 @@ class ServerStatistics:
             )
         camera.has_two_publishers = has_two_publishers
 
-    def note_lateness(self, name: str, is_on_time: bool, age_ms: float) -> None:
-        """Log when a camera's frames begin to arrive too late, and once none was for `ON_TIME_S`, with their number.
+    def note_late(self, name: str, age_ms: float, limit_ms: float) -> None:
+        """Count a camera's frame that came too late; log the first one, until none did for `ON_TIME_S`.
+
+        Args:
+            name: of the camera.
+            age_ms: of the frame when it arrived.
+            limit_ms: up to which a frame set would have waited for it; a younger frame came after later ones.
+        """
+        camera = self._cameras[name]
+        if not camera.late_since_ns:
+            if age_ms > limit_ms:
+                late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
+                log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
+            else:
+                late = "%s: a frame came after later ones, %.0f ms old; such frames are dropped"
+                log.warning(late, name, age_ms, extra=self._about(name))
+            camera.late_since_ns, camera.late_before = camera.last_ns, camera.late
+        camera.late, camera.late_ns = camera.late + 1, camera.last_ns
+        with self._lock:
+            camera.skipped[LATE] += 1
+
+    def note_on_time(self, name: str) -> None:
+        """Log a camera of which no frame was too late for `ON_TIME_S`, with the number of those that were.
 
         On a busy machine some frames are late and others are not: that is one state.
         """
-        camera, limit_ms = self._cameras[name], self._lateness_limit_ms
-        now_ns = camera.last_ns
-        if not is_on_time:
-            if not camera.late_since_ns:
-                if age_ms > limit_ms:
-                    late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
-                    log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
-                else:
-                    late = "%s: a frame came after later ones, %.0f ms old; such frames are dropped"
-                    log.warning(late, name, age_ms, extra=self._about(name))
-                camera.late_since_ns, camera.late_before = now_ns, camera.late
-            camera.late, camera.late_ns = camera.late + 1, now_ns
-            with self._lock:
-                camera.skipped[LATE] += 1
-        elif camera.late_since_ns and age_ms < limit_ms and now_ns - camera.late_ns > ON_TIME_S * 1e9:
+        camera = self._cameras[name]
+        if camera.late_since_ns and camera.last_ns - camera.late_ns > ON_TIME_S * 1e9:
             seconds, count = (camera.late_ns - camera.late_since_ns) * 1e-9, camera.late - camera.late_before
             text = "%s is on time again: %d of its frames in %.0f s were too late and were dropped"
             log.info(text, name, count, seconds, extra=self._about(name))

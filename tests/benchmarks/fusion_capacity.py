@@ -23,7 +23,6 @@ import tyro
 from camera_node.foundation.arrays import Array
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.model.frames import FrameSet
-from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import Latency, RobotPose, TrackingState
 from fusion.rig_graph.rig_monitor import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
@@ -117,7 +116,7 @@ class Queue:
         use: Callable[[int, Sequence[RobotPose]], None] | None = None,
     ) -> None:
         self.load, self.pace, self._use = load, pace, use
-        self._keys, self._statistics = Keys("load"), ServerStatistics(Limits().lateness_ms)
+        self._keys, self._statistics = Keys("load"), ServerStatistics()
         self._ingest = Ingest(self._keys, self._statistics)
         self.tracker = Tracker(load.rig, load.bodies)
         self.tracker.monitors.rig.executor = JudgeProcess()
@@ -196,9 +195,11 @@ class Queue:
         """As `Server` does."""
         frame = self._ingest.receive(data, key, arrival_ns, self.load.rig)
         if frame is not None and (frame := self.tracker.admit(frame)) is not None:
-            self._statistics.note_lateness(
-                frame.camera, self.synchronizer.add(frame), (arrival_ns - frame.t_ns) * 1e-6
-            )
+            if self.synchronizer.add(frame):
+                self._statistics.note_on_time(frame.camera)
+            else:
+                late_ms = (arrival_ns - frame.t_ns) * 1e-6
+                self._statistics.note_late(frame.camera, late_ms, self.synchronizer.limit_ns * 1e-6)
 
     def _encode(self, poses: Sequence[RobotPose]) -> list[bytes]:
         return [encode(msgspec.structs.replace(pose, latency=LATENCY)) for pose in poses]

@@ -37,7 +37,7 @@ class Pipeline:
     """The server from a message to the tracker, without a network."""
 
     def __init__(self, arena: Arena = ARENA) -> None:
-        self.arena, self.statistics = arena, ServerStatistics(150.0)
+        self.arena, self.statistics = arena, ServerStatistics()
         self.ingest, self.synchronizer = Ingest(KEYS, self.statistics), FrameSynchronizer(PERIOD_NS)
         self.tracker = Tracker(arena.cameras, arena.robots)
 

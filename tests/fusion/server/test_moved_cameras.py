@@ -86,7 +86,7 @@ def test_a_camera_that_is_shaken_has_its_pose_again(arena: VirtualArena):
 
 
 def test_a_camera_that_was_excluded_between_two_statuses_is_reported_once():
-    statistics, second = ServerStatistics(150.0), 10**9
+    statistics, second = ServerStatistics(), 10**9
     for name in ("moved", "other"):
         statistics.count_arrival(name, second, second)
     statistics.note_moved("moved")

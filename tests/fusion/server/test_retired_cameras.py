@@ -11,7 +11,7 @@ from fusion.server.server_statistics import ON_TIME_S, SILENT_S, PipelineStatus,
 
 def test_a_retired_camera_is_listed_no_more_until_a_camera_has_its_name_again():
     """Its last frames can arrive long after the request, for a busy server; a node with a fixed name asks for none."""
-    statistics, second = ServerStatistics(150.0), 10**9
+    statistics, second = ServerStatistics(), 10**9
     for name in ("old", "pulled"):
         statistics.count_arrival(name, second, second)
     statistics.retire("old")
@@ -30,26 +30,29 @@ def test_a_retired_camera_is_listed_no_more_until_a_camera_has_its_name_again():
 
 def test_a_camera_that_is_late_now_and_then_is_told_twice(caplog: pytest.LogCaptureFixture):
     """Every second frame for a minute: one line at the begin, one after the end with the number of frames."""
-    statistics, period_ns = ServerStatistics(150.0), 10**8
+    statistics, period_ns = ServerStatistics(), 10**8
     caplog.set_level(logging.INFO, "fusion")
     for k in range(1, 1 + round((60 + 2 * ON_TIME_S) * 10)):
         is_late = k <= 600 and k % 2 == 0
         t_ns = k * period_ns
         statistics.count_arrival("cam0", t_ns, t_ns)
-        statistics.note_lateness("cam0", not is_late, 390.0 if is_late else 20.0)
+        if is_late:
+            statistics.note_late("cam0", 390.0, 150.0)
+        else:
+            statistics.note_on_time("cam0")
     told = [record.getMessage() for record in caplog.records if "appeared" not in record.getMessage()]
     assert told == [
         "cam0 is 390 ms late (limit 150 ms); its late frames are dropped",
         "cam0 is on time again: 300 of its frames in 60 s were too late and were dropped",
     ]
-    statistics.note_lateness("cam0", False, 390.0)
+    statistics.note_late("cam0", 390.0, 150.0)
     assert "390 ms late" in caplog.records[-1].getMessage()
 
 
 def test_frames_that_come_after_later_ones_are_not_said_to_exceed_the_limit(caplog: pytest.LogCaptureFixture):
-    statistics = ServerStatistics(150.0)
+    statistics = ServerStatistics()
     statistics.count_arrival("cam0", 10**9, 10**9)
-    statistics.note_lateness("cam0", False, 60.0)
+    statistics.note_late("cam0", 60.0, 150.0)
     assert caplog.records[-1].getMessage() == (
         "cam0: a frame came after later ones, 60 ms old; such frames are dropped"
     )
