@@ -9,7 +9,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True):
     may have further ones."""
 
     lost_after_s: float = 0.3  # without an observation
-    # How long a frame set waits for a camera from when the fastest one usually delivers; USB cameras can be 100 ms late.
+    # How long a frame set waits for a camera from when the fastest one usually delivers; cheap USB ones lag by 100 ms.
     lateness_ms: float = 150.0
     tracked_sigma_m: float = (
         0.05  # a robot with a larger position sigma is `coasting`, even while it is visible

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Keyframes: frame sets that the rig graph keeps, and which detection of theirs shows which marker.
+"""Keyframes: moments that the rig graph keeps, and which detection shows which marker then.
+
+Cameras may have other rates than the frame sets: a keyframe has of each camera the frame that is nearest to it.
 
 A camera at fault shows its markers elsewhere than its calibration predicts, so detections are assigned again, camera by
 camera: the image shift on which most pairs of expected and detected roundels agree gives first correspondences;
@@ -10,6 +12,7 @@ pose is where the search of a hypothesis begins.
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from scipy.special import chdtri
@@ -54,7 +57,7 @@ class FrameView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A frame set with K of the robots that were tracked all around it.
+    """A moment with K of the robots that were tracked all around it.
 
     Attributes:
         views: of all cameras, also of those at fault.
@@ -123,23 +126,25 @@ class Keyframes:
         self._cameras, self._markers = cameras, markers
         self.kept: deque[Keyframe] = deque(maxlen=most)
         self._history: deque[Snapshot] = deque()
-        self._pending: deque[FrameSet] = deque()
+        self._recent: deque[FrameSet] = deque()
+        self._pending: deque[int] = deque()  # times of the next keyframes
         self._turn = 0
 
     def clear(self) -> None:
         """Forget all keyframes: cameras or robots are others."""
-        self.kept.clear()
-        self._pending.clear()
-        self._history.clear()
+        for of in (self.kept, self._pending, self._recent, self._history):
+            of.clear()
 
     def add(self, frame_set: FrameSet, now: Snapshot) -> bool:
         """Add a frame set and the robots after its update; whether there is a new keyframe, `HALF_NS` old."""
         self._history.append(now)
-        while self._history[0].t_ns < now.t_ns - 4 * HALF_NS:
-            self._history.popleft()
-        if not self._pending or frame_set.t_ns >= self._pending[-1].t_ns + INTERVAL_NS:
-            self._pending.append(frame_set)
-        if self._pending[0].t_ns > now.t_ns - HALF_NS:
+        self._recent.append(frame_set)
+        for of in (self._history, self._recent):
+            while of[0].t_ns < now.t_ns - 4 * HALF_NS:
+                of.popleft()
+        if not self._pending or frame_set.t_ns >= self._pending[-1] + INTERVAL_NS:
+            self._pending.append(frame_set.t_ns)
+        if self._pending[0] > now.t_ns - HALF_NS:
             return False
         keyframe = self._keyframe(self._pending.popleft())
         if keyframe is not None:
@@ -156,12 +161,19 @@ class Keyframes:
         for k, keyframe in enumerate(self.kept):
             views = tuple(replace(view, frame=retimed(view.frame)) for view in keyframe.views)
             self.kept[k] = replace(keyframe, views=views)
-        for k, pending in enumerate(self._pending):
-            self._pending[k] = replace(pending, frames=tuple(map(retimed, pending.frames)))
+        for k, recent in enumerate(self._recent):
+            self._recent[k] = replace(recent, frames=tuple(map(retimed, recent.frames)))
 
-    def _keyframe(self, frame_set: FrameSet) -> Keyframe | None:
-        """The robots of a frame set with mean velocities around it, which stamps of one frame do not change."""
-        t_ns, half = frame_set.t_ns, HALF_NS // 2
+    def _frames_at(self, t_ns: int) -> list[CalibratedFrame]:
+        """Of each camera the frame that is nearest to a time, if no keyframe is nearer."""
+        frames = [frame for frame_set in self._recent for frame in frame_set.frames]
+        frames.sort(key=lambda frame: (frame.camera, abs(frame.t_ns - t_ns)))
+        nearest = [next(of_camera) for _, of_camera in groupby(frames, lambda frame: frame.camera)]
+        return [frame for frame in nearest if abs(frame.t_ns - t_ns) <= INTERVAL_NS / 2]
+
+    def _keyframe(self, t_ns: int) -> Keyframe | None:
+        """The robots of a moment with mean velocities around it, which stamps of one frame do not change."""
+        half = HALF_NS // 2
         first, early, now, late, last = (
             min(self._history, key=lambda s: abs(s.t_ns - at))
             for at in (t_ns - HALF_NS, t_ns - half, t_ns, t_ns + half, t_ns + HALF_NS)
@@ -177,7 +189,7 @@ class Keyframes:
         change = np.mean((inner - mean) ** 2, axis=2).T - noise - more
         rows = np.flatnonzero(np.isin(self._markers.robot, robots))
         scene = self._cameras, self._markers
-        views = tuple(_view(scene, frame, t_ns, now.states, rows) for frame in frame_set.frames)
+        views = tuple(_view(scene, frame, t_ns, now.states, rows) for frame in self._frames_at(t_ns))
         return Keyframe(t_ns, views, robots, states, noise, WIDER * change)
 
 

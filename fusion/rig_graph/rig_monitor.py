@@ -298,6 +298,8 @@ class RigMonitor:
         wait_ns = SUSPICIOUS_NS if self.is_doubtful else pause_ns
         if self._job is not None or len(kept) < min(WINDOWS) or now_ns < self._checked_ns + wait_ns:
             return
+        if not any(len(keyframe.views) > 1 for keyframe in kept[-min(WINDOWS) :]):
+            return  # one camera contradicts no other
         self._checked_ns, self._revision, self._judged_cost = now_ns, self._cameras.revision, usual_cost
         self._given = self._cameras.as_dict(), self._scale, self._markers  # of this time
         self._given_ns, self._is_confirmed = kept[-1].t_ns, False

@@ -23,10 +23,11 @@ from tests.benchmarks.trust import Case, run
 from tests.fusion.clock_faults import ERROR_M, SIGMAS
 from tests.fusion.moved_camera import MOTIONS, MOVE_S, ROBOTS, black, moved
 from tests.fusion.rig_graph.fits import fitted
-from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, ring
+from tests.fusion.synthetic import PERIOD_NS, START_NS, TRIANGLE, WIDE, Arena, ring
 from tests.fusion.tracks import errors
 
 DEADLINE_S = 60.0  # of a process that starts on a busy machine
+PHASES = dict(zip(ring(), Arena.phases, strict=False))
 FRAMES = 170  # of each camera: 20 frame sets that are compared
 
 
@@ -317,3 +318,23 @@ def test_claims_are_as_before_once_the_camera_that_was_moved_has_its_new_pose():
     assert outcome.report == "right", outcome.lines
     degrees = 3 * case.robots
     assert min(outcome.ratios[1:]) > chi2.ppf(1e-3, degrees) / degrees
+
+
+def test_a_moved_camera_is_used_again_among_cameras_of_other_rates():
+    """cam0 is three times as fast as the others, of which cam1 exposes one period earlier: no frame set has frames of
+    all. Keyframes were every third frame set: they had frames of the same two or three cameras each."""
+    before, after = moved(2.0, 0.0)
+    frames = [f for f in before.frames(FRAMES) if is_exposed(f) and before.seconds(f.t_ns) < MOVE_S]
+    frames += [f for f in after.frames(FRAMES) if is_exposed(f) and before.seconds(f.t_ns) >= MOVE_S]
+    tracker = Tracker(before.cameras, ROBOTS)
+    corrections, states = follow(tracker, frames)
+    assert [(c.name, c.camera is None) for c in corrections] == [("cam1", True), ("cam1", False)]
+    assert set(states) == {"tracked"}
+    looks = [c.project_world([[0.0, 0.0, 0.3]]) for c in (tracker.cameras["cam1"], after.cameras["cam1"])]
+    assert np.linalg.norm(looks[0] - looks[1]) < 0.5
+
+
+def is_exposed(frame: CalibratedFrame) -> bool:
+    """Whether a camera exposes then, of a rate that is a third for all but cam0."""
+    number = round((frame.t_ns - START_NS) / PERIOD_NS - PHASES[frame.camera])
+    return frame.camera == "cam0" or number % 3 == (frame.camera != "cam1")

@@ -157,3 +157,18 @@ def test_robots_are_tracked_by_cameras_that_all_lag_by_more_than_the_wait_limit(
         assert arena.judge.wrong == []
         assert arena.judge.rms_m < 1e-3
         assert not any(arena.server.pipeline.synchronizer.late.values())
+
+
+@pytest.mark.ci
+def test_a_camera_that_is_left_alone_contradicts_no_other(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """Keyframes without a robot that two cameras see were judged: the mean of no residuals is adequate to nothing."""
+    with VirtualArena(tmp_path, small_load(robots=2)) as arena:
+        arena.wait(3.0)
+        for name in arena.cameras[1:]:
+            arena.place(name, CameraFault(silent=True, since_ns=arena.clock.now_ns()))
+        arena.wait(4.0)
+        tracker = arena.server.pipeline.tracker
+        assert tracker is not None
+        assert not tracker.monitors.rig.is_doubtful
+        assert "judged" not in caplog.text  # an error: warnings of NumPy are errors here
+        assert arena.judge.wrong == []
