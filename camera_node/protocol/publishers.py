@@ -8,9 +8,9 @@ from camera_node.protocol.messages import Detections
 
 HANDOVER_NS = 1_000_000_000  # after the last frame of a name's owner, the name passes to another node
 HISTORY = 64  # frames of a camera
-# Two stamps of one frame. A node adds the error of its clock by its newest estimate: of frames that a driver delivered
-# twice, the stamps differ by nanoseconds. No camera exposes 10,000 times a second.
-SAME_NS = 100_000
+# Two stamps of one frame, one after the other: a node adds the error of its clock by its newest estimate, so that those
+# of a frame that its driver delivers twice differ by nanoseconds. Older stamps may come again: clocks are set back.
+SAME_NS = 10_000
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ class Publishers:
     def is_repeated(self, message: Detections) -> bool:
         """Whether an admitted frame came before; if not, its stamp is remembered."""
         stamps = self._owners[message.camera].stamps
-        if any(abs(message.t_ns - t_ns) < SAME_NS for t_ns in stamps):
+        if message.t_ns in stamps or (stamps and abs(message.t_ns - stamps[-1]) < SAME_NS):
             return True
         stamps.append(message.t_ns)
         return False
