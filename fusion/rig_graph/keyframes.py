@@ -166,10 +166,10 @@ class Keyframes:
 
     def _frames_at(self, t_ns: int) -> list[CalibratedFrame]:
         """Of each camera the frame that is nearest to a time, if no keyframe is nearer."""
-        frames = [frame for frame_set in self._recent for frame in frame_set.frames]
-        frames.sort(key=lambda frame: (frame.camera, abs(frame.t_ns - t_ns)))
-        nearest = [next(of_camera) for _, of_camera in groupby(frames, lambda frame: frame.camera)]
-        return [frame for frame in nearest if abs(frame.t_ns - t_ns) <= INTERVAL_NS / 2]
+        frames = [f for frame_set in self._recent for f in frame_set.frames]
+        near = [f for f in frames if abs(f.t_ns - t_ns) <= INTERVAL_NS / 2]
+        near.sort(key=lambda f: (f.camera, abs(f.t_ns - t_ns)))
+        return [next(of_camera) for _, of_camera in groupby(near, lambda f: f.camera)]
 
     def _keyframe(self, t_ns: int) -> Keyframe | None:
         """The robots of a moment with mean velocities around it, which stamps of one frame do not change."""

@@ -28,6 +28,7 @@ class _CameraRate:
 
     times: deque[int] = field(default_factory=lambda: deque(maxlen=RATE_FRAMES))
     lags: deque[int] = field(default_factory=lambda: deque(maxlen=RATE_FRAMES))
+    lag_ns: int = 0  # median
     late: int = 0
     interval_ns: int = 0  # median; 0 while it is unknown
 
@@ -38,6 +39,11 @@ class _CameraRate:
         self.times.append(t_ns)
         steps = sorted(b - a for a, b in pairwise(self.times))
         self.interval_ns = steps[(len(steps) - 1) // 2] if len(steps) > 1 else 0  # one step may be a pause
+
+    def add_lag(self, lag_ns: int) -> None:
+        """Add the time from the capture of a frame to its arrival."""
+        self.lags.append(lag_ns)
+        self.lag_ns = median_low(self.lags)
 
     def is_missing(self, end_ns: int) -> bool:
         """Whether a frame is expected before `end_ns`, at the camera's rate, that has not come."""
@@ -88,13 +94,13 @@ class FrameSynchronizer:
     def limit_ns(self) -> int:
         """How long after its capture a frame set waits for a frame: `lateness_ns` more than the frames of the camera
         with the least lag usually take."""
-        lags = [median_low(camera.lags) for camera in self._cameras.values() if self._is_live(camera)]
-        return self.lateness_ns + max(0, min(lags, default=0))
+        lags_ns = [camera.lag_ns for camera in self._cameras.values() if self._is_live(camera)]
+        return self.lateness_ns + max(0, min(lags_ns, default=0))
 
     def add(self, frame: CalibratedFrame) -> bool:
         """Add a frame; return False if it is too late."""
         camera = self._cameras.setdefault(frame.camera, _CameraRate())
-        camera.lags.append(frame.received_ns - frame.t_ns if frame.received_ns else 0)
+        camera.add_lag(frame.received_ns - frame.t_ns if frame.received_ns else 0)
         if frame.t_ns < self._oldest_ns():
             camera.late += 1
             return False

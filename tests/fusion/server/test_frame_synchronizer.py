@@ -115,6 +115,21 @@ def test_cameras_that_all_lag_are_fused_without_loss(lag_ms):
     assert max(now - frame_set.t_ns for now, frame_set in closed[10:]) < lag_ms * MS + PERIOD
 
 
+def test_cameras_that_begin_to_lag_lose_few_frames():
+    """A network becomes slow: after half a second, frame sets wait for its frames."""
+    lags = [20 * MS] * 60 + [300 * MS] * 60
+    arrivals = [
+        (received_ns, frame(name, f.t_ns - START, lag))
+        for k, name in enumerate("abc")
+        for (at_ns, f), lag in zip(frames_of(name, 120, 0.25 * k), lags, strict=True)
+        for received_ns in [at_ns + lag]
+    ]
+    synchronizer = FrameSynchronizer(lateness_ns=LATENESS)
+    closed = play(synchronizer, arrivals)
+    assert sum(synchronizer.late.values()) <= 3 * 15
+    assert {len(frame_set.frames) for _, frame_set in closed[-21:-1]} == {3}
+
+
 def test_frames_that_missed_their_set_are_used_in_the_next_one_at_their_own_time():
     """A camera is slower than the wait limit by half an interval."""
     arrivals = frames_of("a", 40) + frames_of("b", 40, 0.1, LATENESS + PERIOD // 2)
