@@ -15,8 +15,7 @@ from scipy.special import chdtri
 
 from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index
-from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, RIVAL
-from fusion.rig_graph.keyframes import INTERVAL_NS
+from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, INTERVAL_NS, RIVAL
 
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock
 RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crystals have 1e-4, bad drivers more

@@ -38,6 +38,7 @@ POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
 RIVAL = 1e-3  # likelihood of another explanation, relative to the accepted one
 LARGE = 2.0  # ratio of errors to those that the rig states, from which it is reported or corrected
+INTERVAL_NS = 90_000_000  # between keyframes: a tenth of a second, at 30 frame sets a second too
 CONFIRMED = 3  # judgements in a row, of which one may be by chance
 MAX_ITERATIONS, CONVERGED = 20, 1e-4  # relative decrease of the cost
 FIRST_DAMPING = 1e-4

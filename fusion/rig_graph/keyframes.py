@@ -32,9 +32,8 @@ from fusion.model.observations import (
     MatchedObservations,
 )
 from fusion.model.states import Snapshot, States
-from fusion.rig_graph.hypotheses import CAUSES, FREE_SIGMA, RIVAL, Window
+from fusion.rig_graph.hypotheses import CAUSES, FREE_SIGMA, INTERVAL_NS, RIVAL, Window
 
-INTERVAL_NS = 90_000_000  # between keyframes: a tenth of a second, at 30 frame sets a second too
 HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its robots
 # Variance of a mean velocity over that of its difference from the mean in half the time, by white acceleration: the
 # density times HALF / 6, and times HALF / 24.

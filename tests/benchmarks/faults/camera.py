@@ -64,9 +64,15 @@ class SceneDetector(Detector):
 
 
 class SceneCamera(Source):
-    """Delivers the frames of one camera of a load at their times, with the faults of `fault`."""
+    """Delivers the frames of one camera of a load at their times, with the faults of `fault`.
+
+    Attributes:
+        hz: its rate, that of the load unless it is set before the first frame.
+        stamp_sigma_ns: of the errors of its stamps.
+    """
 
     def __init__(self, world: World, name: str, detector: SceneDetector) -> None:
+        self.hz, self.stamp_sigma_ns = world.load.hz, STAMP_SIGMA_NS
         self.dropped, self.fault = 0, CameraFault()
         self._shown = no_roundels()  # by the last frame
         self._held: list[tuple[Frame, Roundels]] = []  # of frames that arrive in the wrong order
@@ -97,7 +103,7 @@ class SceneCamera(Source):
     def next_after(self, seq: int, now_ns: int, delay_ms: float = 0.0) -> int:
         """The number of the next frame; frames that were not fetched in time are skipped."""
         elapsed_s = (now_ns - self._world.epoch_ns - READOUT_NS) * 1e-9 - delay_ms * 1e-3
-        return max(seq + 1, math.floor(elapsed_s * self._world.load.hz - self._phase) + (seq < 0))
+        return max(seq + 1, math.floor(elapsed_s * self.hz - self._phase) + (seq < 0))
 
     def deliver(self, seq: int) -> list[tuple[Frame, Roundels]]:
         """The frames that become available with this one: none, one, or two."""
@@ -141,7 +147,7 @@ class SceneCamera(Source):
     def _expose(self, t_ns: int, fault: CameraFault) -> tuple[Frame, Roundels]:
         world = self._world
         image = self._images[fault.picture if fault.picture in GREY else ""]
-        stamp_ns = fault.stamp_ns(t_ns) + round(self._rng.normal() * STAMP_SIGMA_NS)
+        stamp_ns = fault.stamp_ns(t_ns) + round(self._rng.normal() * self.stamp_sigma_ns)
         if fault.picture in GREY:
             return Frame(image, stamp_ns), no_roundels()
         if fault.picture == "frozen":
@@ -160,7 +166,7 @@ class SceneCamera(Source):
         return Roundels(uv, cov, axes, rng.uniform(-1.5, 1.5, n), level, 200 * level, none, none)
 
     def _time_ns(self, seq: int) -> int:
-        return self._world.epoch_ns + round((seq + self._phase) / self._world.load.hz * 1e9)
+        return self._world.epoch_ns + round((seq + self._phase) / self.hz * 1e9)
 
     def _wait_until(self, t_ns: int) -> bool:
         return not self._closed.wait(max(0, t_ns - time.time_ns()) * 1e-9)

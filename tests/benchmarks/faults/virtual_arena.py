@@ -76,6 +76,9 @@ class VirtualArena:
         robots: the server's robots, if they are not the true ones.
         judge: the class that judges poses.
         judging_s: how long a judgement of the cameras takes.
+
+    Attributes:
+        sources: the cameras by name.
     """
 
     def __init__(
@@ -96,7 +99,7 @@ class VirtualArena:
         self.status: FusionStatus | None = None
         self.camera_status: dict[str, CameraStatus] = {}
         self._rng, self._keys = np.random.default_rng(seed), Keys(ARENA)
-        self._sources = {name: SceneCamera(self.world, name, SceneDetector()) for name in self.cameras}
+        self.sources = {name: SceneCamera(self.world, name, SceneDetector()) for name in self.cameras}
         self._sent = dict.fromkeys(self.cameras, 0)
         self._due: list[tuple[int, str, int]] = []
         self._arrivals: list[tuple[int, str, int, bytes]] = []
@@ -110,7 +113,7 @@ class VirtualArena:
 
     def __enter__(self) -> "VirtualArena":
         logging.getLogger("fusion").addHandler(self._log)
-        for name, source in self._sources.items():
+        for name, source in self.sources.items():
             self._schedule(name, source.next_after(-1, self.clock.t_ns))
         return self
 
@@ -134,11 +137,15 @@ class VirtualArena:
 
     def place(self, camera: str, fault: CameraFault) -> None:
         """Give a camera other faults."""
-        self._sources[camera].place(fault)
+        self.sources[camera].place(fault)
+
+    def transit_s(self, name: str, rng: np.random.Generator) -> float:
+        """How long the next message of a camera takes; messages of one camera stay in their order."""
+        return rng.exponential(TRANSIT_S)
 
     def true_camera(self, name: str) -> Camera:
         """A camera as it is by its faults."""
-        return self._sources[name].true_camera
+        return self.sources[name].true_camera
 
     def cover(self, event: RobotEvent) -> None:
         """Cover a robot for a while."""
@@ -170,12 +177,12 @@ class VirtualArena:
         return server
 
     def _schedule(self, name: str, seq: int) -> None:
-        heapq.heappush(self._due, (self._sources[name].due_ns(seq), name, seq))
+        heapq.heappush(self._due, (self.sources[name].due_ns(seq), name, seq))
 
     def _deliver(self) -> None:
         """The next camera sends the frames that became available."""
         due_ns, name, seq = heapq.heappop(self._due)
-        source, lens = self._sources[name], self.load.rig[name]
+        source, lens = self.sources[name], self.load.rig[name]
         for frame, roundels in source.deliver(seq):
             message = Detections.pack(
                 roundels,
@@ -187,7 +194,7 @@ class VirtualArena:
                 height=lens.height,
             )
             self._sent[name] += 1
-            transit_ns = round(self._rng.exponential(TRANSIT_S) * 1e9)
+            transit_ns = round(self.transit_s(name, self._rng) * 1e9)
             arrival_ns = max(self._arrived_ns[name] + 1, due_ns + transit_ns)
             self._arrived_ns[name] = arrival_ns
             heapq.heappush(self._arrivals, (arrival_ns, name, message.seq, encode(message)))
