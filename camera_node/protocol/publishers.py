@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Decides which frames count where several nodes publish under one camera's name, or one sends a frame twice."""
 
-from collections import deque
-from dataclasses import dataclass, field
+from collections import defaultdict, deque
+from dataclasses import dataclass
 
 from camera_node.protocol.messages import Detections
 
@@ -15,13 +15,12 @@ SAME_NS = 10_000
 
 @dataclass(slots=True)
 class _Owner:
-    """The node whose frames count, when its last frame and the last refused one arrived, and its last stamps."""
+    """The node whose frames count, and when its last frame and the last refused one arrived."""
 
     publisher: int
     last_ns: int
     refused_ns: int | None = None
     is_contested: bool = False
-    stamps: deque[int] = field(default_factory=lambda: deque(maxlen=HISTORY))
 
 
 class Publishers:
@@ -32,6 +31,7 @@ class Publishers:
 
     def __init__(self) -> None:
         self._owners: dict[str, _Owner] = {}
+        self._stamps: defaultdict[str, deque[int]] = defaultdict(lambda: deque(maxlen=HISTORY))  # by camera
 
     def admits(self, message: Detections, received_ns: int) -> bool:
         """Whether a frame is that of the owner of its camera's name, or of its successor.
@@ -44,8 +44,7 @@ class Publishers:
         if owner is None or (
             owner.publisher != message.publisher and abs(received_ns - owner.last_ns) > HANDOVER_NS
         ):
-            stamps = deque[int](maxlen=HISTORY) if owner is None else owner.stamps
-            self._owners[message.camera] = _Owner(message.publisher, received_ns, stamps=stamps)
+            self._owners[message.camera] = _Owner(message.publisher, received_ns)
             return True
         if owner.publisher != message.publisher:
             owner.refused_ns = received_ns
@@ -58,7 +57,7 @@ class Publishers:
 
     def is_repeated(self, message: Detections) -> bool:
         """Whether an admitted frame came before; if not, its stamp is remembered."""
-        stamps = self._owners[message.camera].stamps
+        stamps = self._stamps[message.camera]
         if message.t_ns in stamps or (stamps and abs(message.t_ns - stamps[-1]) < SAME_NS):
             return True
         stamps.append(message.t_ns)

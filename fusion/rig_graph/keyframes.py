@@ -131,16 +131,16 @@ class Keyframes:
 
     def clear(self) -> None:
         """Forget all keyframes: cameras or robots are others."""
-        for of in (self.kept, self._pending, self._recent, self._history):
-            of.clear()
+        for queue in (self.kept, self._pending, self._recent, self._history):
+            queue.clear()
 
     def add(self, frame_set: FrameSet, now: Snapshot) -> bool:
         """Add a frame set and the robots after its update; whether there is a new keyframe, `HALF_NS` old."""
         self._history.append(now)
         self._recent.append(frame_set)
-        for of in (self._history, self._recent):
-            while of[0].t_ns < now.t_ns - 4 * HALF_NS:
-                of.popleft()
+        for queue in (self._history, self._recent):
+            while queue[0].t_ns < now.t_ns - 4 * HALF_NS:
+                queue.popleft()
         if not self._pending or frame_set.t_ns >= self._pending[-1] + INTERVAL_NS:
             self._pending.append(frame_set.t_ns)
         if self._pending[0] > now.t_ns - HALF_NS:
@@ -164,7 +164,7 @@ class Keyframes:
             self._recent[k] = replace(recent, frames=tuple(map(retimed, recent.frames)))
 
     def _frames_at(self, t_ns: int) -> list[CalibratedFrame]:
-        """Of each camera the frame that is nearest to a time, if no keyframe is nearer."""
+        """Of each camera the frame that is nearest to a time, within half the interval between keyframes."""
         frames = [f for frame_set in self._recent for f in frame_set.frames]
         near = [f for f in frames if abs(f.t_ns - t_ns) <= INTERVAL_NS / 2]
         near.sort(key=lambda f: (f.camera, abs(f.t_ns - t_ns)))

@@ -55,7 +55,7 @@ class FrameSynchronizer:
 
     Frame sets have a constant period. Their phase is that of the first camera by name, whose frames are in the middle
     of their sets. A frame that missed its set is used in the next one at its own time; an older one is dropped and
-    counted: by then accelerations, which nobody predicts, have moved robots by more than it would correct.
+    counted: constant velocities no longer predict where the robots were then.
 
     Args:
         period_ns: of the frame sets; without it that of the fastest camera, estimated from its first frames. A camera
@@ -232,7 +232,11 @@ class FrameSynchronizer:
         is_complete = has_begun and any(self._is_live(c) for c in self._cameras.values())
         if is_complete and not self._count_missing(end_ns):
             return True
-        return now_ns >= end_ns + self.lateness_ns and now_ns >= end_ns + self.limit_ns
+        if (
+            now_ns < end_ns + self.lateness_ns
+        ):  # with most messages; the limit is at least this, and takes longer
+            return False
+        return now_ns >= end_ns + self.limit_ns
 
     def _note(self, name: str, camera: _CameraRate) -> None:
         """Note whether a camera is missing in the open set, after its times changed."""

@@ -80,7 +80,7 @@ class ConditionedArena(VirtualArena):
             source = self.sources[name]
             source.hz = condition.hz or source.hz
             source.stamp_sigma_ns += round(condition.stamp_ms * 1e6)
-            source.place(CameraFault(delay_ms=condition.lag_ms))
+            self.place(name, CameraFault(delay_ms=condition.lag_ms))
 
     def transit_s(self, name: str, rng: np.random.Generator) -> float:
         """As an arena's, and the delays that vary."""

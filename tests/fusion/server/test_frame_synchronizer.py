@@ -119,10 +119,9 @@ def test_cameras_that_begin_to_lag_lose_few_frames():
     """A network becomes slow: after half a second, frame sets wait for its frames."""
     lags = [20 * MS] * 60 + [300 * MS] * 60
     arrivals = [
-        (received_ns, frame(name, f.t_ns - START, lag))
+        (at_ns + lag, frame(name, f.t_ns - START, lag))
         for k, name in enumerate("abc")
         for (at_ns, f), lag in zip(frames_of(name, 120, 0.25 * k), lags, strict=True)
-        for received_ns in [at_ns + lag]
     ]
     synchronizer = FrameSynchronizer(lateness_ns=LATENESS)
     closed = play(synchronizer, arrivals)
@@ -142,7 +141,7 @@ def test_frames_that_missed_their_set_are_used_in_the_next_one_at_their_own_time
 
 
 def test_frames_that_missed_two_sets_are_dropped_and_counted():
-    """Robots have moved since, as nobody predicts: by such frames a camera that was 0.3 s late looked turned."""
+    """Robots have accelerated since: by such frames, a camera that was 0.3 s late looked turned."""
     arrivals = frames_of("a", 40) + frames_of("b", 40, 0.1, 2 * LATENESS)
     synchronizer = FrameSynchronizer(PERIOD, LATENESS)
     closed = play(synchronizer, arrivals)

@@ -161,7 +161,7 @@ def test_robots_are_tracked_by_cameras_that_all_lag_by_more_than_the_wait_limit(
 
 @pytest.mark.ci
 def test_a_camera_that_is_left_alone_contradicts_no_other(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """Keyframes without a robot that two cameras see were judged: the mean of no residuals is adequate to nothing."""
+    """Keyframes without a robot that two cameras see were judged: no hypothesis explained the mean of no residuals."""
     with VirtualArena(tmp_path, small_load(robots=2)) as arena:
         arena.wait(3.0)
         for name in arena.cameras[1:]:
