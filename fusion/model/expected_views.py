@@ -22,7 +22,7 @@ SHIFTED_PX = 2 * BIN_PX  # from where a shift predicts them
 # Between expected and detected markers: robots that follow a camera at fault are expected pixels away, and discs of
 # other markers are at least their own diameter away.
 GATES_PX = (SHIFTED_PX, 10.0, 8.0, 8.0)
-ITERATIONS = 5
+ITERATIONS, CONVERGED = 5, 1e-5  # Gauss-Newton steps, and the last one, rad and m: hundredths of a pixel
 MOVED, TURNED = 6, 3  # free errors of a camera's pose: its rotation is first
 
 
@@ -120,6 +120,8 @@ def _fit_pose(camera: Camera, T: Array, points: Array, measured: Array, free: in
         T = T.copy()
         T[:3, 3] += T[:3, :3] @ step[3:]
         T[:3, :3] = T[:3, :3] @ rotation_from_vector(step[:3])
+        if np.abs(step).max() < CONVERGED:
+            break
     return T
 
 

@@ -74,12 +74,10 @@ class FrameSetFit:
 
     Attributes:
         is_doubtful: whether most robots contradict their predictions.
-        usual_cost: of an equation of the median robot in the last frame sets: 1 if all claims hold.
         displaced: cameras that show most markers elsewhere, and in how many frame sets in a row.
     """
 
     is_doubtful: bool
-    usual_cost: float
     displaced: Mapping[int, int]
 
 

@@ -24,14 +24,11 @@ FALSE_ALARM = 1e-6  # probability of a larger cost: once in ten hours of 30 fram
 
 
 class ResidualMonitor:
-    """The usual residual of a frame set, and the usual cost of its fit.
-
-    Attributes:
-        usual_cost: of an equation of the median robot: 1 if the claims hold.
-    """
+    """The usual residual of a frame set, and the usual cost of its fit."""
 
     def __init__(self) -> None:
-        self._usual_px, self.usual_cost, self._learned = 0.0, 1.0, 0
+        self._usual_px, self._learned = 0.0, 0
+        self._usual_cost = 1.0  # of an equation of the median robot: 1 if the claims hold
 
     @property
     def slack_px(self) -> float:
@@ -48,7 +45,7 @@ class ResidualMonitor:
         n = 2 * int(count.sum())
         if self._learned < LEARNED or not n:
             return False
-        limit = max(float(chdtri(n, FALSE_ALARM)) / n, MIN_RATIO**2 * self.usual_cost)
+        limit = max(float(chdtri(n, FALSE_ALARM)) / n, MIN_RATIO**2 * self._usual_cost)
         return bool(_mean_cost(cost, count) > limit)
 
     def is_explained(self, cost: float, count: int) -> bool:
@@ -58,7 +55,7 @@ class ResidualMonitor:
             cost: what they add to the cost of the fit.
             count: of these detections; they show nothing if they have no more equations than a pose has errors.
         """
-        allowed = chdtri(2 * count, REJOINED) * max(1.0, self.usual_cost)
+        allowed = chdtri(2 * count, REJOINED) * max(1.0, self._usual_cost)
         return 2 * count > POSE_ERRORS and bool(cost < allowed)
 
     def learn(self, squared_px: Array, cost: Array, count: Index) -> None:
@@ -68,7 +65,7 @@ class ResidualMonitor:
         self._learned += 1
         share = 1 / min(self._learned, LEARNED)
         self._usual_px += share * (_median_px(squared_px) - self._usual_px)
-        self.usual_cost += share * (_mean_cost(cost, count) - self.usual_cost)
+        self._usual_cost += share * (_mean_cost(cost, count) - self._usual_cost)
 
 
 def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:

@@ -41,6 +41,15 @@ class Departure:
         return self.offset_s + self.rate * (t_ns - self.t_ns) * 1e-9
 
 
+def clock_gains(P: Array, H: Array, y: Array) -> Array:
+    """(C,) how much less keyframes cost if the clock of one camera alone has any other offset: a rank-one change of
+    the covariance P (8 C, 8 C) of the cameras' errors, of which the keyframes show H e = y."""
+    offsets = ERRORS * np.arange(len(y) // ERRORS) + CAUSES["clock"].start
+    with_them = np.linalg.solve(np.eye(len(y)) + H @ P, np.column_stack([y, H]))
+    score, information = with_them[:, 0], with_them[:, 1:]
+    return np.asarray(score[offsets] ** 2 / (np.diag(information)[offsets] + CHANGED_SIGMA[0] ** -2), float)
+
+
 class ClockWalk:
     """Offsets and rates of C clocks from their corrected stamps.
 
@@ -124,10 +133,7 @@ class ClockWalk:
             return float(off @ (free - with_them[seen, seen] @ off)), np.asarray(with_them, float)
 
         cost, P = explain(self.P)
-        # What another offset of one clock alone explains: a rank-one change of the covariance.
-        with_window = np.eye(len(y)) + H @ self.P[seen, seen]
-        score, information = np.linalg.solve(with_window, off), np.linalg.solve(with_window, H)
-        gain = score[self.offsets] ** 2 / (np.diag(information)[self.offsets] + CHANGED_SIGMA[0] ** -2)
+        gain = clock_gains(self.P[seen, seen], H, off)
         camera = int(np.argmax(gain))
         if (
             self._n > 2

@@ -495,13 +495,14 @@ def _suspects(poses: Sequence[Fit]) -> list[int]:
     return sorted(f.hypothesis.cameras[0] for f in ranked)
 
 
-def fit(window: Window, hypothesis: Hypothesis) -> Fit:
-    """Fit cameras and robots from the start of the hypothesis, by Levenberg-Marquardt with Cauchy weights."""
+def fit(window: Window, hypothesis: Hypothesis, max_iterations: int = MAX_ITERATIONS) -> Fit:
+    """Fit cameras and robots from the start of the hypothesis, by Levenberg-Marquardt with Cauchy weights; without an
+    iteration, the equations are those at the start."""
     priors = _Priors.of(window, hypothesis)
     bodies, places = np.zeros((len(window.states), 12)), np.zeros((len(window.markers), 3))
     at = _evaluate(window, priors, hypothesis.start, bodies, places)
     damping = FIRST_DAMPING
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(max_iterations):
         by_camera, by_body, by_place = _step(window, priors, at, damping)
         tried = _evaluate(window, priors, at.errors + by_camera, at.bodies + by_body, at.places + by_place)
         if tried.cost >= at.cost:

@@ -39,7 +39,7 @@ HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its 
 # density times HALF / 6, and times HALF / 24.
 WIDER = 4.0
 MAX_ROBOTS = 4  # of a keyframe; the next one has others
-FOUND = 0.8  # of the expected markers within the last gate: detections need no other assignment
+FOUND = 0.8  # of all pairs that may be within the last gate: detections need no other assignment
 N_MEAN, N_PREDICTED = 3, 15  # moments of a mean motion, and those that show how well it predicts
 MIN_SEEN = 4  # detections of a robot in a keyframe: 8 equations of its pose, 6
 NEGLIGIBLE = 1e-6  # share of free errors, that keeps covariances of exact cameras regular
@@ -217,7 +217,7 @@ def _mean_motion(first: Snapshot, last: Snapshot, robots: Index) -> tuple[Array,
 
 
 def window_of(
-    keyframes: Sequence[Keyframe], cameras: CameraArray, markers: MarkerTable
+    keyframes: Sequence[Keyframe], cameras: CameraArray, markers: MarkerTable, may_have_moved: bool = True
 ) -> tuple[Window, Array]:
     """The problem of some keyframes, and for each camera the errors (C, 8) that explain its images alone.
 
@@ -225,12 +225,13 @@ def window_of(
         keyframes: at least one.
         cameras: C cameras of the rig.
         markers: of all robots.
+        may_have_moved: whether cameras are searched for other poses by which they show more markers.
     """
     starts = np.zeros((len(cameras.names), ERRORS))
     found: list[list[tuple[CalibratedFrame, Index, Index]]] = [[] for _ in keyframes]
     for k, name in enumerate(cameras.names):
         views = _views(keyframes, name)
-        T, matches = _match(cameras[name], [view for _, view in views])
+        T, matches = _match(cameras[name], [view for _, view in views], may_have_moved)
         inverse = np.linalg.inv(cameras[name].matrix()) @ T
         starts[k, :3], starts[k, 3:6] = vector_from_rotation(inverse[None, :3, :3])[0], inverse[:3, 3]
         for (number, view), (rows, detections) in zip(views, matches, strict=True):
@@ -243,7 +244,9 @@ def _views(keyframes: Sequence[Keyframe], name: str) -> list[tuple[int, FrameVie
     return [(k, v) for k, keyframe in enumerate(keyframes) for v in keyframe.views if v.frame.camera == name]
 
 
-def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tuple[Index, Index]]]:
+def _match(
+    camera: Camera, views: Sequence[FrameView], may_have_moved: bool
+) -> tuple[Array, list[tuple[Index, Index]]]:
     """T_world_cam (4, 4) that explains the images, and rows of expected and of detected roundels by view.
 
     Views that show their markers where the calibration expects them need no other pose: a camera that was moved in the
@@ -251,8 +254,9 @@ def _match(camera: Camera, views: Sequence[FrameView]) -> tuple[Array, list[tupl
     """
     expected, detected = [view.expected for view in views], [view.frame.roundels.uv for view in views]
     matches = [mutual_nearest(e.uv, uv, GATES_PX[-1]) for e, uv in zip(expected, detected, strict=True)]
-    others = [k for k, e in enumerate(expected) if len(matches[k][0]) < FOUND * len(e.rows)]
-    if sum(len(expected[k].rows) for k in others) < ERRORS:
+    possible = [min(len(e.rows), len(uv)) for e, uv in zip(expected, detected, strict=True)]
+    others = [k for k, most in enumerate(possible) if len(matches[k][0]) < FOUND * most]
+    if not may_have_moved or sum(len(expected[k].rows) for k in others) < ERRORS:
         return camera.matrix(), matches
     T, found = match_moved(camera, [expected[k] for k in others], [detected[k] for k in others])
     for k, match in zip(others, found, strict=True):

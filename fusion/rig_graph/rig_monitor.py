@@ -2,7 +2,8 @@
 """Finds cameras that were moved, and their new poses, from the robots of the last seconds.
 
     frame sets            -> `Keyframes`: with the robots around them
-    twice a second        -> `judge`: which hypothesis about the cameras explains the keyframes?
+    every second or so    -> `judge`: which hypothesis about the cameras explains the keyframes?
+    between, twice one    -> `watch`: has a clock changed? then they are judged at once
     a pose, decided       -> the camera is excluded until its pose is known, then used with it
     undecided             -> the cameras that contradict each other are reported, and all are used as they are
 
@@ -36,13 +37,14 @@ from fusion.model.frames import FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import FrameSetFit, Snapshot
 from fusion.protocol.pose_messages import Contradiction
-from fusion.rig_graph.clock_walk import ClockWalk, Departure
+from fusion.rig_graph.clock_walk import ClockWalk, Departure, clock_gains
 from fusion.rig_graph.hypotheses import (
     CAUSES,
     CONFIRMED,
     FALSE_ALARM,
     LARGE,
     MIN_FOR_PAIRS,
+    RIVAL,
     Fit,
     Hypothesis,
     Verdict,
@@ -69,10 +71,12 @@ CHECK_NS, SUSPICIOUS_NS = (
     500_000_000,
     200_000_000,
 )  # between two checks: usually, and while cameras contradict
-USUAL_SHARE = 0.1  # of a core, while nothing changes
-# Ratio of the usual costs of frame sets, now and when the last judgement began, from which the next one is due: clocks
-# that drifted by 5000 ppm had it after 1 to 2 s; without a fault it varied by a third at most.
-GREW = 1.5
+# Of a core, while nothing changes: judgements, and looks at the clocks between them. By times from one frame set to
+# another one, which are longer than the work.
+USUAL_SHARE, WATCH_SHARE = 0.06, 0.2
+GREW = (
+    1.5  # ratio of what another offset of a clock explains, now and to the last judgement, for the next one
+)
 CHANGED = 2.0  # ratio of the mean robust costs in both halves of a window in which something changed
 USUAL = (
     0.2  # mean robust cost that shows nothing: twice that of Gaussian noise, E[log(1 + chi2_2 / CAUCHY^2)]
@@ -124,11 +128,11 @@ class RigMonitor:
     def __init__(self, cameras: CameraArray, markers: MarkerTable) -> None:
         self._cameras, self._markers = cameras, markers
         self._keyframes = Keyframes(cameras, markers, max(WINDOWS))
-        self._job: Future[Judgement | None] | None = None
+        self._job: Future[Judgement | float | None] | None = None
         self._judged = 0  # jobs that were taken since they were asked for
         self._checked_ns = self._revision = self._n_undecided = 0
-        self._pause_ns = 0  # after the last job
-        self._judged_cost = np.inf  # the usual cost of frame sets when the last job began
+        self._pause_ns = self._watched_ns = self._watch_pause_ns = 0
+        self._gain = self._judged_gain = 0.0  # of the last `watch`, and the least since a judgement began
         self._is_contradicted = False
         self._walk = ClockWalk(len(cameras.names))
         self._departures: tuple[Departure, ...] = ()
@@ -256,7 +260,7 @@ class RigMonitor:
         self._was_doubtful = is_doubtful
         self._remember_moment(frame_set, now)
         if self._keyframes.add(frame_set, now):
-            self._judge(now.t_ns, fit.usual_cost)
+            self._judge(now.t_ns)
         return self._act_on_judgements(now.t_ns, recalibrates)
 
     def _act_on_judgements(
@@ -267,7 +271,6 @@ class RigMonitor:
             self._judged += 1
             if self._revision != self._cameras.revision:
                 return ()
-            self._pause_ns = round((now_ns - self._checked_ns) / USUAL_SHARE)
             try:
                 judged = job.result()
             except (
@@ -275,6 +278,11 @@ class RigMonitor:
             ):  # of a process that ended, or of a singular system: the next keyframes are others
                 log.exception("the cameras can't be judged")
                 return ()
+            if judged is not None and not isinstance(judged, tuple):
+                self._watch_pause_ns = round((now_ns - self._watched_ns) / WATCH_SHARE)
+                self._gain, self._judged_gain = judged, min(judged, self._judged_gain)
+                return ()
+            self._pause_ns = round((now_ns - self._checked_ns) / USUAL_SHARE)
             if judged is None:
                 self._is_contradicted = True
             elif self._is_confirmed or self._moved or not _blames_one_of_three(*judged[:2]):
@@ -284,27 +292,38 @@ class RigMonitor:
                 self._start(partial(confirm, judged, *self._given, tuple(self._moments)))
         return ()
 
-    def _judge(self, now_ns: int, usual_cost: float) -> None:
-        """Judge the keyframes if it is time."""
+    def _judge(self, now_ns: int) -> None:
+        """Judge the newest keyframes, or only watch the clocks, if it is time."""
         kept = tuple(self._keyframes.kept)
+        if self._job is not None or len(kept) < min(WINDOWS):
+            return
+        if not any(len(keyframe.views) > 1 for keyframe in kept[-min(WINDOWS) :]):
+            return  # one camera contradicts no other
+        scene = self._cameras.as_dict(), self._scale, self._markers  # of this time
+        self._revision = self._cameras.revision
+        if now_ns >= self._checked_ns + self._wait_ns:
+            self._checked_ns = self._watched_ns = now_ns
+            self._judged_gain, self._is_confirmed = self._gain, False
+            self._given, self._given_ns = scene, kept[-1].t_ns
+            given = self._shapes, self._measured_ns, sorted(self._moved)
+            self._start(partial(judge_latest, kept, *scene, *given))
+        elif now_ns >= self._watched_ns + max(CHECK_NS, self._watch_pause_ns):
+            self._watched_ns = now_ns
+            self._start(partial(watch, kept[-min(WINDOWS) :], *scene))
+
+    @property
+    def _wait_ns(self) -> int:
+        """From one judgement to the next."""
+        if self.is_doubtful:
+            return SUSPICIOUS_NS
         is_urgent = (
             self._was_doubtful
             or bool(self._walk.departed)
             or self._walk.is_suspicious
             or self._cameras.error_scale > self._scale  # claims grew, and nothing explains why
-            or usual_cost > GREW * self._judged_cost
+            or self._gain > max(float(chdtri(1, RIVAL)), GREW * self._judged_gain)
         )
-        pause_ns = CHECK_NS if is_urgent else max(CHECK_NS, self._pause_ns)
-        wait_ns = SUSPICIOUS_NS if self.is_doubtful else pause_ns
-        if self._job is not None or len(kept) < min(WINDOWS) or now_ns < self._checked_ns + wait_ns:
-            return
-        if not any(len(keyframe.views) > 1 for keyframe in kept[-min(WINDOWS) :]):
-            return  # one camera contradicts no other
-        self._checked_ns, self._revision, self._judged_cost = now_ns, self._cameras.revision, usual_cost
-        self._given = self._cameras.as_dict(), self._scale, self._markers  # of this time
-        self._given_ns, self._is_confirmed = kept[-1].t_ns, False
-        given = self._shapes, self._measured_ns, sorted(self._moved)
-        self._start(partial(judge_latest, kept, *self._given, *given))
+        return CHECK_NS if is_urgent else max(CHECK_NS, self._pause_ns)
 
     def _exclude_displaced(self, displaced: Mapping[int, int]) -> ExtrinsicsCorrection | None:
         if len(displaced) != 1:
@@ -318,7 +337,7 @@ class RigMonitor:
         self._forget()
         return ExtrinsicsCorrection(name, None)
 
-    def _start(self, job: Callable[[], Judgement | None]) -> None:
+    def _start(self, job: Callable[[], Judgement | float | None]) -> None:
         self._job = _done(job) if self.executor is None else self.executor.submit(job)
 
     def _act(
@@ -611,6 +630,17 @@ def judge_latest(
             if is_constant and verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict, _measure(window, verdict, keyframes[-n:], shapes, since_ns)
     return None
+
+
+def watch(
+    keyframes: Sequence[Keyframe], cameras: Mapping[str, Camera], error_scale: float, markers: MarkerTable
+) -> float:
+    """How much better keyframes are explained if the clock of one camera, any of them, has another offset, squared
+    standard deviations: velocities of robots explain it to a frame set, and a judgement takes ten times as long."""
+    array = CameraArray(dict(cameras), error_scale)
+    window, _ = window_of(keyframes, array, markers, may_have_moved=False)
+    none = fit(window, Hypothesis.of(None, (), len(window.names)), max_iterations=0)
+    return float(clock_gains(window.covariance(1.0), *none.equations).max())
 
 
 def _blames_one_of_three(window: Window, verdict: Verdict) -> bool:

@@ -16,7 +16,7 @@ from fusion.model.observations import MarkerTable
 from fusion.rig_graph.hypotheses import FALSE_ALARM, FREE_SHAPE_M, WAND_SIGMA
 
 Equations = tuple[Array, Array]  # H (3 m, 3 m) and y (3 m,) of H p = y, about displacements p of m markers
-TOLERANCES_M = PLACE_M * 2.0 ** np.arange(7)  # of the places of markers, if they are measured less well
+TOLERANCES_M = np.array([PLACE_M * 2.0**k for k in range(7)])  # of markers that are measured less well
 # Powers with which a larger tolerance of all markers, and of one, is less probable: the least that keep the claims of
 # robots of which windows show little below a millimetre.
 RARER, RARER_ONE = 2, 3
@@ -114,73 +114,40 @@ def posterior(H: Array, y: Array) -> tuple[Array, Array]:
     Windows show a shape, and not where a robot's frame is in it. How well its places are measured is unknown, and how
     well that of one marker: a mixture of normal distributions, each as likely as it makes the windows.
     """
+    n, t = len(y) // 3, TOLERANCES_M
     e, V = np.linalg.eigh(H)
-    known = [_Places.of(np.maximum(e, 0.0), V, y, tolerance_m) for tolerance_m in TOLERANCES_M]
-    known += [p.with_one_off(t) for p in known for t in p.larger]
-    cost = np.concatenate([p.cost for p in known])
-    shares = np.exp((cost.min() - cost) / 2)
+    information = np.maximum(e, 0.0) + t[:, None] ** -2
+    P = V / information[:, None, :] @ V.T
+    means = P @ y
+    cost = np.log(information * t[:, None] ** 2).sum(1) - means @ y + _rarity(t, RARER)
+
+    # Each marker with a larger tolerance than the others: P + A B A^T, with its columns A of P.
+    of_all, of_one = np.triu_indices(len(t), 1)
+    A = P.reshape(len(t), 3 * n, n, 3).swapaxes(1, 2)
+    less = (t[of_all] ** -2 - t[of_one] ** -2)[:, None, None, None]
+    left = np.eye(3) - less * A.reshape(len(t), n, n, 3, 3)[of_all][:, range(n), range(n)]
+    B, off = less * np.linalg.inv(left), means.reshape(-1, n, 3)[of_all]
+    change = np.einsum("skab,skb->ska", B, off)
+    larger = 6 * np.log(t[of_one] / t[of_all]) + _rarity(t[of_one], RARER_ONE) + cost[of_all]
+    cost_of_one = larger[:, None] + np.linalg.slogdet(left)[1] - np.sum(off * change, axis=2)
+    means_of_one = means[of_all, None] + np.einsum("skia,ska->ski", A[of_all], change)
+
+    costs = np.concatenate([cost, cost_of_one.ravel()])
+    shares = np.exp((costs.min() - costs) / 2)
     shares /= shares.sum()
-    mean = shares @ np.concatenate([p.means for p in known])
-    of_each = np.split(shares, np.cumsum([len(p.cost) for p in known])[:-1])
-    parts = [p.covariance(mine, mean) for p, mine in zip(known, of_each, strict=True)]
-    return mean.reshape(-1, 3), np.sum(parts, axis=0)
+    every = np.concatenate([means, means_of_one.reshape(-1, 3 * n)])
+    mean = shares @ every
+    share_of_one = shares[len(t) :].reshape(-1, n)
+    share, added = shares[: len(t)].copy(), np.zeros((len(t), n, 3, 3))
+    np.add.at(share, of_all, share_of_one.sum(1))
+    np.add.at(added, of_all, share_of_one[:, :, None, None] * B)
+    covariance = np.tensordot(share, P, 1) + np.tensordot(A @ added, A, axes=([0, 1, 3], [0, 1, 3]))
+    return mean.reshape(n, 3), covariance + (every - mean).T @ (shares[:, None] * (every - mean))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Places:
-    """Places of the markers of a robot by K hypotheses of a tolerance.
-
-    Attributes:
-        tolerance_m: of all places.
-        P: (3 m, 3 m) covariance with it.
-        cost: (K,) twice the negative logarithm of the likelihood of the windows and of the tolerances.
-        means: (K, 3 m) displacements.
-        added: (K, 3 m, 3) and (K, 3, 3): factors A and B of what the covariance of each has beside P, A B A^T.
-    """
-
-    tolerance_m: float
-    P: Array
-    cost: Array
-    means: Array
-    added: tuple[Array, Array]
-
-    @classmethod
-    def of(cls, e: Array, V: Array, y: Array, tolerance_m: float) -> "_Places":
-        """One tolerance of all places, by eigenvalues and eigenvectors of H."""
-        information = e + tolerance_m**-2
-        P = V / information @ V.T
-        cost = np.log(information * tolerance_m**2).sum() - y @ P @ y + _rarity(tolerance_m, RARER)
-        none = np.zeros((1, len(y), 3)), np.zeros((1, 3, 3))
-        return cls(tolerance_m, P, np.array([cost]), (P @ y)[None], none)
-
-    @property
-    def larger(self) -> list[float]:
-        """The larger tolerances."""
-        return [t for t in TOLERANCES_M.tolist() if t > self.tolerance_m]
-
-    def with_one_off(self, tolerance_m: float) -> "_Places":
-        """Each of the markers has a larger tolerance than the others."""
-        n, less = len(self.P) // 3, self.tolerance_m**-2 - tolerance_m**-2
-        columns = self.P.reshape(-1, n, 3).transpose(1, 0, 2)
-        left = np.eye(3) - less * columns.reshape(n, n, 3, 3)[range(n), range(n)]
-        B, off = np.asarray(less * np.linalg.inv(left), float), self.means.reshape(n, 3)
-        of_one = 6 * np.log(tolerance_m / self.tolerance_m) + np.linalg.slogdet(left)[1]
-        cost = self.cost + of_one - np.einsum("ki,kij,kj->k", off, B, off) + _rarity(tolerance_m, RARER_ONE)
-        return _Places(
-            tolerance_m, self.P, cost, self.means + np.einsum("kia,kab,kb->ki", columns, B, off), (columns, B)
-        )
-
-    def covariance(self, shares: Array, mean: Array) -> Array:
-        """(3 m, 3 m) the part by hypotheses that have these shares (K,) of a mixture with a mean."""
-        A, B = self.added
-        added = np.tensordot(A @ (shares[:, None, None] * B), A, axes=([0, 2], [0, 2]))
-        off = self.means - mean
-        return shares.sum() * self.P + added + off.T @ (shares[:, None] * off)
-
-
-def _rarity(tolerance_m: float, power: int) -> float:
-    """Twice the negative logarithm of how probable a tolerance is: it falls with this power."""
-    return 2 * power * float(np.log(tolerance_m / PLACE_M))
+def _rarity(tolerance_m: Array, power: int) -> Array:
+    """Twice the negative logarithm of how probable tolerances are: that falls with this power."""
+    return np.asarray(2 * power * np.log(tolerance_m / PLACE_M), float)
 
 
 def _of_any_frame_and_size(places: Array, H: Array, y: Array) -> Equations:

@@ -93,11 +93,6 @@ class RobustUpdate:
         """Whether the last frame set contradicted the predictions."""
         return self._left_out is not None or self.added_px2 > 0
 
-    @property
-    def usual_cost(self) -> float:
-        """Of the last frame sets; see `ResidualMonitor`."""
-        return self._residuals.usual_cost
-
     def settle(self) -> None:
         """The rig graph judged what the detections contradict: what is usual from now on is learnt."""
         self._residuals, self._left_out, self.added_px2 = ResidualMonitor(), None, 0.0

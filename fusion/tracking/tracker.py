@@ -189,7 +189,7 @@ class Tracker:
     def check_extrinsics(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
         now = Snapshot(frame_set.t_ns, self.table.states, self.table.located)
-        fit = FrameSetFit(self.robust.is_doubtful, self.robust.usual_cost, self.own.displaced)
+        fit = FrameSetFit(self.robust.is_doubtful, self.own.displaced)
         corrections = self.monitors.check_extrinsics(frame_set, now, fit, self._recalibrates)
         if self.monitors.rig.is_settled and fit.is_doubtful:
             self.robust.settle()

@@ -6,12 +6,16 @@ from concurrent.futures import Executor, Future
 from functools import partial
 from typing import Any
 
+from fusion.rig_graph.rig_monitor import watch
+
+WATCHING = 0.1  # time of `watch` over that of a judgement
+
 
 class LateResults(Executor):
     """Computes a result when it is due.
 
     Args:
-        delay: from the call to its result, in units of the clock.
+        delay: from the call for a judgement to its result, in units of the clock.
         now: the clock.
     """
 
@@ -20,7 +24,8 @@ class LateResults(Executor):
         self._waiting: list[tuple[float, Future[Any], Callable[[], Any]]] = []
 
     def submit(self, fn, /, *args, **kwargs) -> Future[Any]:
-        self._waiting.append((self._now() + self._delay, Future(), partial(fn, *args, **kwargs)))
+        delay = self._delay * (WATCHING if getattr(fn, "func", None) is watch else 1.0)
+        self._waiting.append((self._now() + delay, Future(), partial(fn, *args, **kwargs)))
         return self._waiting[-1][1]
 
     def release(self) -> None:

@@ -8,7 +8,7 @@ from scipy.special import chdtri
 from camera_node.detection.roundels import Roundels
 from fusion.model.frames import CalibratedFrame
 from fusion.monitoring.camera_clocks import CameraClocks
-from fusion.rig_graph.clock_walk import OFFSET_SIGMA_S, ClockWalk, Departure
+from fusion.rig_graph.clock_walk import CHANGED_SIGMA, OFFSET_SIGMA_S, ClockWalk, Departure, clock_gains
 from fusion.rig_graph.hypotheses import CAUSES, ERRORS, FALSE_ALARM, FREE_SIGMA
 
 WINDOW_S, SIGMA_S = 2.4, 1e-4  # between windows, and of an offset in one
@@ -183,3 +183,19 @@ def test_a_camera_that_moved_does_not_look_like_a_clock():
             assert not is_used or not walk.take_departures()
         deviations.append(walk.x[walk.offsets] / np.sqrt(np.diag(walk.P)[walk.offsets]))
     assert np.mean(np.square(deviations)) < 1.7  # chi-square with 60 degrees of freedom, one in a thousand
+
+
+def test_what_another_offset_explains_is_the_cost_that_it_saves():
+    """The cost of keyframes that show H e = y is y^T H^-1 (H^-1 + P)^-1 H^-1 y, if errors have the covariance P."""
+    rng = np.random.default_rng(3)
+    J, K = rng.normal(size=(2, 60, 4 * ERRORS))
+    H, y, P = J.T @ J, J.T @ rng.normal(size=60), K.T @ K / 100
+
+    def cost(P: np.ndarray) -> float:
+        shown = np.linalg.solve(H, y)
+        return shown @ np.linalg.solve(np.linalg.inv(H) + P, shown)
+
+    for k, gain in enumerate(clock_gains(P, H, y)):
+        other = P.copy()
+        other[ERRORS * k + 6, ERRORS * k + 6] += CHANGED_SIGMA[0] ** 2
+        assert gain == pytest.approx(cost(P) - cost(other), rel=1e-6)

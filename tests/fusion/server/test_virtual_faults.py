@@ -9,7 +9,7 @@ import pytest
 
 from fusion.rig_graph.hypotheses import Hypothesis, fit, has_changed
 from fusion.rig_graph.keyframes import window_of
-from fusion.rig_graph.rig_monitor import WINDOWS
+from fusion.rig_graph.rig_monitor import CHECK_NS, WINDOWS
 from tests.benchmarks.chaos import ChaosResult, virtual_chaos
 from tests.benchmarks.faults.arena import small_load
 from tests.benchmarks.faults.virtual_arena import VirtualArena
@@ -52,8 +52,8 @@ def test_a_clock_that_drifts_makes_no_pose_wrong_while_judgements_are_late(tmp_p
 
 @pytest.mark.ci
 def test_a_drift_is_judged_before_a_frame_set_contradicts_the_predictions(tmp_path: Path):
-    """A judgement takes 0.4 s, and the next one begins 4 s later, unless residuals grow. A clock that a judgement
-    blames is uncertain before others confirm that."""
+    """A judgement takes 0.4 s, and the next one begins 7 s later, unless keyframes show another clock. A clock that a
+    judgement blames is uncertain before others confirm that."""
     with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
         arena.wait(5.0)
         tracker = arena.server.pipeline.tracker
@@ -64,11 +64,24 @@ def test_a_drift_is_judged_before_a_frame_set_contradicts_the_predictions(tmp_pa
             begun_ns = monitors.rig._checked_ns
             return _happens(arena, within_s, lambda: monitors.rig._checked_ns > begun_ns)
 
-        assert begins(6.0)
+        assert begins(8.0)
         arena.place("cam2", CameraFault(drift_ppm=5000.0, since_ns=arena.clock.now_ns()))
         assert begins(2.0)
         assert _happens(arena, 3.0, lambda: monitors.clocks.health()["cam2"].state == "uncertain")
         assert not tracker.robust.is_doubtful
+
+
+@pytest.mark.ci
+def test_one_judgement_is_enough_for_what_it_does_not_change(tmp_path: Path):
+    """What keyframes show of a clock, if it does not grow after a judgement, makes none due."""
+    with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
+        arena.wait(5.0)
+        tracker = arena.server.pipeline.tracker
+        assert tracker is not None
+        rig = tracker.monitors.rig
+        for judged, least_ns in ((0.0, CHECK_NS), (10.0, 2 * CHECK_NS)):
+            rig._pause_ns, rig._gain, rig._judged_gain = 2 * CHECK_NS, 11.0, judged
+            assert rig._wait_ns == least_ns
 
 
 @pytest.mark.ci
