@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Frames of calibrated cameras, and frame sets."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,7 +27,8 @@ class CalibratedFrame:
         stamp_ns: capture time as the camera published it; 0 without a message.
         sent_ns, received_ns: times of the message; 0 offline.
         exposure_us, detect_us: durations; 0 where unknown.
-        clock_sigma_s: standard deviation of `t_ns` by the clock.
+        clock_sigma_s: standard deviation of `t_ns` by the clock, which frames have in common.
+        stamp_sigma_s: by errors of single stamps.
         readout_s: time in which a rolling shutter reads all rows, see `Detections`; `t_ns` is that of the middle.
     """
 
@@ -40,6 +42,7 @@ class CalibratedFrame:
     exposure_us: float = 0.0
     detect_us: float = 0.0
     clock_sigma_s: float = 0.0
+    stamp_sigma_s: float = 0.0
     readout_s: float = 0.0
 
     @classmethod
@@ -65,6 +68,11 @@ class CalibratedFrame:
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
         return cls(name, t_ns, roundels, measure(lens, roundels), **timing)
+
+    @property
+    def time_sigma_s(self) -> float:
+        """Standard deviation of `t_ns`."""
+        return math.hypot(self.clock_sigma_s, self.stamp_sigma_s)
 
     def select(self, rows: Index) -> "CalibratedFrame":
         """The frame with some of its roundels."""

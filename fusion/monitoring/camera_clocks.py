@@ -25,6 +25,8 @@ log = logging.getLogger("fusion")
 ClockState = Literal["correct", "uncertain", "corrected"]
 REPORTED_S = 0.0005  # smallest correction that is reported; later ones when it has doubled
 MAX_MOTION_M = 0.005  # of a robot in the standard deviation of a camera's clock, so that it locates the robot
+# Irregularity of stamps: as of good drivers, and half of what is reported.
+REGULAR_S, REPORTED_IRREGULAR_NS = 0.0005, 0.5e6
 CERTAIN = 3.0  # standard deviations by which a correction may be wrong before a lag contradicts it: 1 in 700
 DECAY_S = 10.0  # of an offset that most corrections have in common: a fault of a clock adds 0.2 ms to it
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
@@ -51,6 +53,7 @@ class _Clock:
         stepped_s: the part of the correction that the steps of its stamps show.
         since_ns, now_ns: the time of the last estimate, and of the last frame.
         reported_s: the correction that was last reported.
+        irregular_ns: the standard deviation of single stamps that was last reported.
     """
 
     check: StampCheck
@@ -63,6 +66,7 @@ class _Clock:
     since_ns: int = 0
     now_ns: int = 0
     reported_s: float = 0.0
+    irregular_ns: float = REPORTED_IRREGULAR_NS
 
     def at(self, t_ns: int) -> float:
         """The correction at a time, s."""
@@ -78,6 +82,17 @@ class _Clock:
         """Standard deviation of the correction of the last frame: the rate is not known exactly."""
         grown_s = self.rate_sigma * (self.now_ns - self.since_ns) * 1e-9
         return math.hypot(self.sigma_s, grown_s, self.doubt_s)
+
+    def report_irregular(self, name: str) -> None:
+        """Log that stamps are irregular, and again once they are twice as much."""
+        if self.check.sigma_ns > 2 * self.irregular_ns:
+            self.irregular_ns = self.check.sigma_ns
+            log.warning(
+                "camera %s: its frames have irregular stamps, by %.1f ms; robots in motion are located by it with this "
+                "error",
+                *(name, 1e-6 * self.check.sigma_ns),
+                extra=about(name),
+            )
 
     @property
     def is_off(self) -> bool:
@@ -159,6 +174,9 @@ class CameraClocks:
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None if that time is in the future."""
         name, clock = frame.camera, self._clocks[frame.camera]
+        if clock.check.sigma_ns > 1e9 * max(REGULAR_S, frame.clock_sigma_s):
+            clock.report_irregular(name)
+            frame = replace(frame, stamp_sigma_s=1e-9 * clock.check.sigma_ns)
         if clock.since_ns or clock.known_s:
             correction_s, sigma_s = clock.at(frame.t_ns), math.hypot(frame.clock_sigma_s, clock.known_s)
             if clock.is_off and abs(correction_s - clock.reported_s) > REPORTED_S + abs(clock.reported_s):
@@ -206,5 +224,5 @@ def _common(values: Sequence[float]) -> float:
 def uncertain(frame_set: FrameSet, speed_m_s: float) -> set[str]:
     """Cameras of a frame set whose time is not known well enough to locate robots at this speed, while that of two
     others is: by what the frames state, so that a replay repeats it."""
-    found = {f.camera for f in frame_set.frames if f.clock_sigma_s * speed_m_s > MAX_MOTION_M}
+    found = {f.camera for f in frame_set.frames if f.time_sigma_s * speed_m_s > MAX_MOTION_M}
     return found if len({f.camera for f in frame_set.frames}) > len(found) + 1 else set()

@@ -4,19 +4,24 @@
 The interval to the stamp before is free of the delays of arrivals: of a camera with a constant rate it is a multiple of
 the usual one, else the stamps jumped or the camera paused. The lag, arrival minus stamp, shows which: stamps that jump
 ahead by J lower it by J, and no frame arrives before it was sent; an interval below the usual one is no pause.
+
+How far stamps are from a constant rate is their standard deviation: sensors run by crystals, drivers and programs that
+take the time when a frame arrives do not.
 """
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from statistics import median
+from itertools import accumulate, pairwise
+from statistics import linear_regression, median
 
 HISTORY, LEARNED = 64, 16  # frames of a camera, and how many of them define what is usual
 MIN_JUMP_NS = 4_000_000  # of lags, which vary with the time of detection
 EARLY_SHARE = 0.25  # of the usual lag above the smallest, by which the next one may be smaller still
 MIN_IRREGULAR = 0.1  # of the interval between frames
-MISSED = 1, 2, 3  # intervals in the usual step between stamps, of a busy machine
+MISSED = 8  # most intervals in the usual step between stamps, of a busy machine
+EXACT_NS = 100_000  # of an interval; less makes no difference to robots
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +33,14 @@ class StampJump:
 
 
 class StampCheck:
-    """The last stamps and lags of one camera."""
+    """The last stamps and lags of one camera.
+
+    Attributes:
+        sigma_ns: standard deviation of single stamps by the last `LEARNED` of them; 0 before.
+    """
 
     def __init__(self) -> None:
+        self.sigma_ns = 0.0
         self._stamps: deque[int] = deque(maxlen=LEARNED)
         self._lags: deque[int] = deque(maxlen=HISTORY)
 
@@ -41,8 +51,13 @@ class StampCheck:
             t_ns, received_ns: its stamp and its arrival.
             least_lag_ns: between these, if the frame is not to arrive before it was sent: the correction of the stamps.
         """
-        lag = received_ns - t_ns
-        jump = self._jump(t_ns, lag, least_lag_ns) if len(self._lags) >= LEARNED else None
+        lag, jump = received_ns - t_ns, None
+        if len(self._lags) >= LEARNED:
+            stamps = sorted(self._stamps)
+            steps = [after - before for before, after in pairwise(stamps)]
+            interval = _interval(steps)
+            self.sigma_ns = _irregularity(steps, interval)
+            jump = self._jump(t_ns, lag, least_lag_ns, steps, interval)
         if jump is not None:
             self._stamps.clear()
             self._lags.clear()
@@ -50,12 +65,10 @@ class StampCheck:
         self._lags.append(lag)
         return jump
 
-    def _jump(self, t_ns: int, lag: int, least_lag: float) -> StampJump | None:
-        stamps = sorted(self._stamps)
-        steps = [after - before for before, after in pairwise(stamps)]
-        intervals = [max(1.0, median(steps)) / n for n in MISSED]
-        fitting = (T for T in intervals if all(_is_multiple(step, T) for step in steps))
-        interval, since = next(fitting, intervals[0]), t_ns - stamps[-1]
+    def _jump(
+        self, t_ns: int, lag: int, least_lag: float, steps: Sequence[int], interval: float
+    ) -> StampJump | None:
+        since = t_ns - max(self._stamps)
         if abs(since - interval) <= MIN_IRREGULAR * interval:
             return None  # the next frame; the lags of queued ones fall
         low, usual, high = min(self._lags), median(self._lags), max(self._lags)
@@ -88,6 +101,24 @@ class StampCheck:
         since = t_ns - max(self._stamps)
         is_new = min(abs(t_ns - stamp) for stamp in self._stamps) > MIN_IRREGULAR * interval
         return _is_multiple(since, interval) and is_new and t_ns > min(self._stamps) - interval
+
+
+def _interval(steps: Sequence[int]) -> float:
+    """The usual one between frames, of which all steps are multiples if frames are missing."""
+    usual = max(1.0, median(steps))
+    intervals = (usual / n for n in range(1, MISSED + 1))
+    return next((T for T in intervals if all(_is_multiple(step, T) for step in steps)), usual)
+
+
+def _irregularity(steps: Sequence[int], interval: float) -> float:
+    """Standard deviation of stamps with these steps from the best constant rate."""
+    counts = [max(1, round(step / interval)) for step in steps]
+    if all(abs(step - n * interval) < EXACT_NS for step, n in zip(steps, counts, strict=True)):
+        return 0.0
+    numbers, stamps = list(accumulate(counts, initial=0)), list(accumulate(steps, initial=0))
+    rate, start = linear_regression(numbers, stamps)
+    squares = sum((t - start - rate * n) ** 2 for n, t in zip(numbers, stamps, strict=True))
+    return math.sqrt(squares / (len(stamps) - 2))
 
 
 def _is_multiple(step: float, interval: float) -> bool:

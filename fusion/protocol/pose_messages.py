@@ -275,8 +275,9 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
     """The frames of a frame set, so that a replay fuses the same frames as the server did.
 
     Columns, one row a frame: `stamps` (F,) <i8 the `t_ns` of its `Detections`; `times` (F,) <i8 its capture time as it
-    was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds. `judged`: how many
-    judgements of the cameras, which run beside tracking, the server took after it; None of older servers.
+    was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds; `stamp_sigmas` (F,) <f8
+    that by errors of single stamps, empty of older servers. `judged`: how many judgements of the cameras, which run
+    beside tracking, the server took after it; None of older servers.
     """
 
     version: int = VERSION
@@ -285,6 +286,7 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
     stamps: bytes
     times: bytes
     clock_sigmas: bytes
+    stamp_sigmas: bytes = b""
     judged: int | None = None
 
     @classmethod
@@ -297,20 +299,24 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
             stamps=np.array([frame.stamp_ns for frame in frames], "<i8").tobytes(),
             times=np.array([frame.t_ns for frame in frames], "<i8").tobytes(),
             clock_sigmas=np.array([frame.clock_sigma_s for frame in frames], "<f8").tobytes(),
+            stamp_sigmas=np.array([frame.stamp_sigma_s for frame in frames], "<f8").tobytes(),
             judged=judged,
         )
 
     def check(self) -> None:
         """Raise MessageError unless the columns' sizes agree."""
         n = 8 * len(self.cameras)
-        if not len(self.stamps) == len(self.times) == len(self.clock_sigmas) == n:
+        of_stamps = len(self.stamp_sigmas) or n
+        if not len(self.stamps) == len(self.times) == len(self.clock_sigmas) == of_stamps == n:
             raise MessageError(f"the columns have other sizes than those of {len(self.cameras)} frames")
 
-    def rows(self) -> list[tuple[str, int, int, float]]:
-        """Camera, stamp, capture time (ns) and standard deviation of the clock (s) of each frame."""
-        columns = np.frombuffer(self.stamps, "<i8"), np.frombuffer(self.times, "<i8")
-        sigmas = np.frombuffer(self.clock_sigmas, "<f8").tolist()
-        return list(zip(self.cameras, *(column.tolist() for column in columns), sigmas, strict=True))
+    def rows(self) -> list[tuple[str, int, int, float, float]]:
+        """Camera, stamp, capture time (ns) and its standard deviations by the clock and by single stamps (s) of each
+        frame."""
+        times = [np.frombuffer(column, "<i8").tolist() for column in (self.stamps, self.times)]
+        of_stamps = self.stamp_sigmas or bytes(len(self.clock_sigmas))
+        sigmas = [np.frombuffer(column, "<f8").tolist() for column in (self.clock_sigmas, of_stamps)]
+        return list(zip(self.cameras, *times, *sigmas, strict=True))
 
 
 SKIPPED_S = 10  # seconds, of `CameraHealth.skipped`

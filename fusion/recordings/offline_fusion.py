@@ -272,15 +272,15 @@ def _with_their_frames(recording: ArenaRecording) -> Iterator[tuple[FusedFrames,
 
 
 def _is_complete(fused: FusedFrames, held: "Held") -> bool:
-    return all((name, stamp_ns) in held for name, stamp_ns, _, _ in fused.rows())
+    return all((name, stamp_ns) in held for name, stamp_ns, *_ in fused.rows())
 
 
 def _frames(fused: FusedFrames, messages: "Held", cameras: dict[str, Camera]) -> Iterator[CalibratedFrame]:
-    for name, stamp_ns, t_ns, clock_sigma_s in fused.rows():
+    for name, stamp_ns, t_ns, clock_sigma_s, stamp_sigma_s in fused.rows():
         message = messages.get((name, stamp_ns))
         frame = None if message is None else admit(message, cameras)
         if isinstance(frame, CalibratedFrame):
-            yield replace(frame, t_ns=t_ns, clock_sigma_s=clock_sigma_s)
+            yield replace(frame, t_ns=t_ns, clock_sigma_s=clock_sigma_s, stamp_sigma_s=stamp_sigma_s)
 
 
 def cameras_of(recording: ArenaRecording, path: Path, rig: Path | None) -> dict[str, Camera]:

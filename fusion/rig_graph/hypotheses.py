@@ -91,6 +91,13 @@ class Window:
         return self.observations.detections.camera
 
     @property
+    def stamp_variance(self) -> Array:
+        """(N,) variance of each observation's time by errors of single stamps, s^2. The n detections of a frame have a
+        common error: each counts n times the variance, so that the frame shows its camera's clock no better."""
+        frame, sigma = self.observations.discs.frame, self.observations.detections.exposures.stamp_sigma
+        return sigma[frame] ** 2 * np.bincount(frame, minlength=1)[frame]
+
+    @property
     def marker(self) -> Index:
         """(N,) of each observation, of the M markers."""
         return np.searchsorted(self.markers, self.observations.discs.marker)
@@ -596,11 +603,23 @@ def _evaluate(window: Window, priors: _Priors, errors: Array, bodies: Array, pla
     by_place = by_body[:, :, POSITION] @ states.R[discs.body]
     visible = (by_camera != 0).any((1, 2))
     r = by_body[:, :, 12] - by_camera[:, :, 7] * errors[window.camera, 7, None]
-    squared = np.where(visible, np.sum(r**2, 1), np.nan)
+    rows = np.concatenate([by_body[:, :, :12], by_camera, by_place, r[:, :, None]], 2)
+    rows = with_errors_of_stamps(rows, by_camera[:, :, CAUSES["clock"].start], window.stamp_variance)
+    squared = np.where(visible, np.sum(rows[:, :, -1] ** 2, 1), np.nan)
     capped = np.nan_to_num(squared, nan=BEHIND)
     cost = float(_core.CAUCHY**2 * np.log1p(capped / _core.CAUCHY**2).sum())
-    rows = np.concatenate([by_body[:, :, :12], by_camera, by_place, r[:, :, None]], 2)
     return _Point(errors, bodies, places, rows, squared, cost + priors.cost(errors, bodies, places))
+
+
+def with_errors_of_stamps(rows: Array, velocity: Array, variance: Array) -> Array:
+    """Whitened rows (N, 2, K) of equations with the noise of stamps as well: (I + s^2 u u^T)^(-1/2) times the rows, of
+    image velocities u (N, 2) and variances s^2 (N,)."""
+    squared = np.sum(velocity**2, axis=1)
+    some = np.flatnonzero(variance * squared > 0)
+    u, along = velocity[some], squared[some]
+    less = (1 / np.sqrt(1 + variance[some] * along) - 1) / along
+    rows[some] += less[:, None, None] * u[:, :, None] * np.einsum("na,nak->nk", u, rows[some])[:, None]
+    return rows
 
 
 def _eliminate(

@@ -243,7 +243,7 @@ class Tracker:
         return {self.table.names[k]: self._reasons.get(k, default) for k in missing}
 
     def _used(self, frame_set: FrameSet) -> FrameSet:
-        is_known = not any(frame.clock_sigma_s for frame in frame_set.frames)
+        is_known = not any(frame.time_sigma_s for frame in frame_set.frames)
         return self.monitors.used(frame_set, 0.0 if is_known else self.table.speed_m_s)
 
     def _claim(self) -> None:

@@ -3,9 +3,11 @@
 
 from dataclasses import replace
 
-from camera_node.protocol.messages import encode
+import msgspec
+
+from camera_node.protocol.messages import decode, encode
 from fusion.model.frames import FrameSet
-from fusion.protocol.pose_messages import RobotPose
+from fusion.protocol.pose_messages import FusedFrames, RobotPose
 from fusion.recordings.offline_fusion import OfflineArena, fuse_frame_sets
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
@@ -49,3 +51,17 @@ def test_a_replay_takes_judgements_when_the_server_took_them():
     )
     assert again == messages(poses)
     assert at_once != again
+
+
+def test_recordings_repeat_how_well_the_times_of_frames_are_known():
+    """Those of older servers state no errors of single stamps."""
+    (before, _), errors = moved(2.0, 0.0), {"clock_sigma_s": 2e-3, "stamp_sigma_s": 3e-3}
+    frames = tuple(replace(frame, **errors) for frame in before.frames(1))
+    message = FusedFrames.of(FrameSet(frames[0].t_ns, frames), 0)
+    for recorded, stamp_sigma_s in (
+        (message, 3e-3),
+        (msgspec.structs.replace(message, stamp_sigmas=b""), 0.0),
+    ):
+        again = decode(encode(recorded), FusedFrames)
+        again.check()
+        assert again.rows() == [(f.camera, f.stamp_ns, f.t_ns, 2e-3, stamp_sigma_s) for f in frames]

@@ -17,6 +17,7 @@ from fusion.rig_graph.hypotheses import (
     decide,
     is_contradicted,
     retract,
+    with_errors_of_stamps,
 )
 from tests.fusion.native.scene import ARRAY, CAMERAS, scene
 from tests.fusion.rig_graph.fits import fitted
@@ -224,3 +225,13 @@ def test_errors_of_a_cause_are_free_and_no_others():
         free = Hypothesis.of(cause, (1,), 3).free
         assert free[1, columns].all()
         assert free.sum() == len(range(*columns.indices(ERRORS)))
+
+
+def test_errors_of_stamps_are_noise_along_image_velocities():
+    """Whitened rows have the information J^T (I + s^2 u u^T)^-1 J; without motion or errors they stay."""
+    rng = np.random.default_rng(5)
+    rows, u, variance = rng.normal(size=(4, 2, 9)), rng.normal(size=(4, 2)), np.array([0.0, 0.3, 4.0, 1.0])
+    u[3] = 0.0
+    found = with_errors_of_stamps(rows.copy(), u, variance)
+    for J, shown, v, s2 in zip(rows, found, u, variance, strict=True):
+        assert shown.T @ shown == pytest.approx(J.T @ np.linalg.solve(np.eye(2) + s2 * np.outer(v, v), J))
