@@ -17,7 +17,7 @@ from statistics import median_high, median_low
 from typing import Literal
 
 from camera_node.foundation.logs import about
-from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.frames import MAX_CLOCK_ERROR_S, CalibratedFrame, FrameSet
 from fusion.monitoring.stamp_check import StampCheck
 from fusion.rig_graph.clock_walk import Departure
 
@@ -88,8 +88,8 @@ class _Clock:
         if self.check.sigma_ns > 2 * self.irregular_ns:
             self.irregular_ns = self.check.sigma_ns
             log.warning(
-                "camera %s: its frames have irregular stamps, by %.1f ms; robots in motion are located by it with this "
-                "error",
+                "camera %s: its frames have irregular stamps, by %.1f ms, which poses of moving robots claim; let its "
+                "driver state when frames were exposed",
                 *(name, 1e-6 * self.check.sigma_ns),
                 extra=about(name),
             )
@@ -174,9 +174,10 @@ class CameraClocks:
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None if that time is in the future."""
         name, clock = frame.camera, self._clocks[frame.camera]
-        if clock.check.sigma_ns > 1e9 * max(REGULAR_S, frame.clock_sigma_s):
+        if (irregular_s := min(1e-9 * clock.check.sigma_ns, MAX_CLOCK_ERROR_S)) > REGULAR_S:
             clock.report_irregular(name)
-            frame = replace(frame, stamp_sigma_s=1e-9 * clock.check.sigma_ns)
+            in_common_s = math.sqrt(max(0.0, frame.clock_sigma_s**2 - irregular_s**2))
+            frame = replace(frame, stamp_sigma_s=irregular_s, clock_sigma_s=in_common_s)
         if clock.since_ns or clock.known_s:
             correction_s, sigma_s = clock.at(frame.t_ns), math.hypot(frame.clock_sigma_s, clock.known_s)
             if clock.is_off and abs(correction_s - clock.reported_s) > REPORTED_S + abs(clock.reported_s):

@@ -273,6 +273,13 @@ class OwnDetections:
         if not len(others):
             return found
         density = detection_density(self._cameras, seen, others)
+        gate_px2 = np.pi * GATE * self._variance_px2(states, seen)
+        robot, frame = np.nonzero(gate_px2 * density > CLUTTERED)
+        found[robot, seen.exposures.camera[frame]] = True
+        return found
+
+    def _variance_px2(self, states: States, seen: DetectionTable) -> Array:
+        """(R, F) of a coordinate of the predicted images of robots in each frame, px^2, by their positions."""
         camera, tau = seen.exposures.camera, seen.exposures.tau
         of_p, of_both, of_v = (
             np.einsum("nii->n", states.P[:, a, b])[:, None]
@@ -280,10 +287,7 @@ class OwnDetections:
         )
         variance = (of_p + 2 * tau * of_both + tau**2 * of_v) / 3
         squared_m2 = np.sum((states.p[:, None] - self._cameras.centres[camera]) ** 2, axis=2)
-        gate = np.pi * GATE * self._cameras.focal[camera] ** 2 * variance  # px^2, at a distance of 1 m
-        robot, frame = np.nonzero(gate * density > CLUTTERED * squared_m2)
-        found[robot, camera[frame]] = True
-        return found
+        return np.asarray(self._cameras.focal[camera] ** 2 * variance / squared_m2, float)
 
     def _accepted(self, given: AssignedFrames, view: Index, certain: Mask, doubts: _Doubts) -> Index:
         """The uncertain assignments that are more probable as those of their robot.
@@ -337,13 +341,20 @@ class OwnDetections:
         return found
 
     def _shown_elsewhere(self, given: AssignedFrames, camera: int, rows: Index) -> int:
-        """How many of the markers `rows` the frames of a camera show where one turn of it explains."""
+        """How many of the markers `rows` the frames of a camera show where one turn of it explains, outside the gates
+        of their predictions: fewer are assigned within these where a frame has several labelings."""
         name, seen = self._cameras.names[camera], given.detections
         frames = np.flatnonzero(seen.exposures.camera == camera)
         scene = self._cameras, name, given.states
         expected = [ExpectedViews.of(*scene, seen.exposures.tau[k], (self._markers, rows)) for k in frames]
         detected = [seen.uv[:, seen.frame == k].T for k in frames]
-        return sum(len(shown) for shown, _ in match_moved(self._cameras[name], expected, detected, TURNED)[1])
+        pairs = match_moved(self._cameras[name], expected, detected, TURNED)[1]
+        gate_px2 = GATE * (self._variance_px2(given.states, seen) + self._cameras.error_px[camera] ** 2)
+        n = 0
+        for k, views, uv, (shown, there) in zip(frames, expected, detected, pairs, strict=True):
+            off_px2 = np.sum((uv[there] - views.uv[shown]) ** 2, axis=1)
+            n += int(np.sum(off_px2 > gate_px2[self._markers.robot[views.rows[shown]], k]))
+        return n
 
     def _count(self, view: Index) -> Index:
         """(R, C) numbers of assignments."""

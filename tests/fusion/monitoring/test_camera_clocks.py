@@ -313,3 +313,18 @@ def test_no_pose_is_wrong_after_a_step_that_arrivals_hide(step_ms: float):
     assert outcome.moves == []
     assert 2.5 - PERIOD_S < outcome.reported_s("cam1") < 3.5
     assert outcome.in_use_since_s("cam1") < 4.5
+
+
+@pytest.mark.parametrize("declared_s", [0.0, 1e-3, 1e-2])
+def test_what_a_camera_declares_contains_the_errors_of_its_single_stamps(declared_s: float):
+    """Frames with these have no more in common than the rest."""
+    clocks, frame = CameraClocks(tuple(LOAD.rig)), next(iter(LOAD.frames(1 / LOAD.hz)))
+    for k, error_s in enumerate(3e-3 * np.random.default_rng(4).normal(size=40)):
+        t_ns = START_NS + round(k * PERIOD_S * 1e9)
+        stamp_ns = t_ns + round(1e9 * error_s)
+        frame = replace(frame, t_ns=stamp_ns, received_ns=t_ns + 12_000_000, clock_sigma_s=declared_s)
+        clocks.observe(frame)
+    admitted = clocks.admit(frame)
+    assert admitted is not None
+    assert admitted.stamp_sigma_s == pytest.approx(3e-3, rel=0.5)
+    assert admitted.time_sigma_s == pytest.approx(max(declared_s, admitted.stamp_sigma_s))

@@ -301,6 +301,16 @@ def test_no_other_camera_or_robot_is_reported(kind: str, cameras: int, reported:
         assert max(outcome.ratios[1:]) < 2.0
 
 
+@pytest.mark.ci
+def test_markers_that_a_camera_shows_under_unsure_numbers_are_not_elsewhere():
+    """Claims contain a wand that may be 1 % short, 20 mm, so that three markers of four may be several of these, and
+    are not assigned. They are where they are predicted: the camera was excluded as moved, and poses were 16 times off
+    their claim."""
+    outcome = run(Case(kind="wand 1 % short", cameras=3, seed=0, robots=1, speed_m_s=0.0))
+    assert not [line for line in outcome.lines if "was moved" in line]
+    assert max(outcome.ratios[1:]) < 2.0
+
+
 @pytest.mark.slow
 def test_robots_at_rest_show_no_clock():
     """Noise was their velocity: a camera that turned by 0.1 degrees got a clock of 1.3 s, and a good clock drifted."""
