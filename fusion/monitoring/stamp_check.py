@@ -20,7 +20,7 @@ HISTORY, LEARNED = 64, 16  # frames of a camera, and how many of them define wha
 MIN_JUMP_NS = 4_000_000  # of lags, which vary with the time of detection
 EARLY_SHARE = 0.25  # of the usual lag above the smallest, by which the next one may be smaller still
 MIN_IRREGULAR = 0.1  # of the interval between frames
-MISSED = 8  # most intervals in the usual step between stamps, of a busy machine
+MISSED = 32  # most intervals in the usual step between stamps, of a busy machine
 EXACT_NS = 100_000  # of an interval; less makes no difference to robots
 
 

@@ -206,10 +206,10 @@ class ClockWalk:
             Departure(k, self._t_ns, *a.tolist(), *b.tolist())
             for k, a, b in zip(self.departed, alone, sigma, strict=True)
         ]
-        others_now = [  # whose corrections stay, known no better than an offset that may be theirs
-            Departure(k, self._t_ns, 0.0, 0.0, *np.hypot(of_k[0], s_of_k[0]).tolist())
+        others_now = [  # whose corrections stay, known no better than an offset that may be theirs beside these
+            Departure(k, self._t_ns, 0.0, 0.0, *np.hypot(of_k[-1], s_of_k[-1]).tolist())
             for k in self._corrected.difference(self.departed)
-            for _, of_k, s_of_k in [explain([k])]
+            for _, of_k, s_of_k in [explain([*self.departed, k])]
         ]
         if self._n > 2:  # of two, the one that departed before departs again
             self.departed = [

@@ -144,7 +144,7 @@ def test_errors_of_single_stamps_show_in_their_intervals(sigma_ms: float):
     assert np.percentile(found, 99) < 2 * sigma_ms
 
 
-@pytest.mark.parametrize("taken", [1.0, 0.8, 0.3])
+@pytest.mark.parametrize("taken", [1.0, 0.8, 0.3, 0.1])
 def test_stamps_of_a_constant_rate_are_exact_also_if_frames_are_missing(taken: float):
     rng = np.random.default_rng(3)
     errors = 20_000 * rng.normal(size=1000)

@@ -8,7 +8,14 @@ from scipy.special import chdtri
 from camera_node.detection.roundels import Roundels
 from fusion.model.frames import CalibratedFrame
 from fusion.monitoring.camera_clocks import CameraClocks
-from fusion.rig_graph.clock_walk import CHANGED_SIGMA, OFFSET_SIGMA_S, ClockWalk, Departure, clock_gains
+from fusion.rig_graph.clock_walk import (
+    CHANGED_SIGMA,
+    OFFSET_SIGMA_S,
+    RATE_SIGMA,
+    ClockWalk,
+    Departure,
+    clock_gains,
+)
 from fusion.rig_graph.hypotheses import CAUSES, ERRORS, FALSE_ALARM, FREE_SIGMA
 
 WINDOW_S, SIGMA_S = 2.4, 1e-4  # between windows, and of an offset in one
@@ -130,6 +137,18 @@ def test_an_offset_that_is_not_significant_is_claimed_and_not_corrected():
     (found,) = (d for d in walk.take_departures() if d.camera == 2)
     assert found.offset_s == 0.0
     assert found.sigma_s > 2e-4
+
+
+def test_a_clock_that_departs_leaves_those_certain_that_were_corrected_before():
+    """They were claimed as if each of them alone explained it, by thousands of ppm; where robots were lost meanwhile,
+    nothing was measured any more, and claims grew to 0.1 s."""
+    walk, next_ns = settled(4, 0, 1, 2)
+    walk.update(next_ns, *about_offsets(np.array([0.0, 0.0, 0.0, 0.033])))
+    first, *others = walk.take_departures()
+    assert (first.camera, first.offset_s) == (3, pytest.approx(0.033, rel=0.05))
+    assert sorted(d.camera for d in others) == [0, 1, 2]
+    assert max(d.sigma_s for d in others) < OFFSET_SIGMA_S
+    assert max(d.rate_sigma for d in others) < RATE_SIGMA
 
 
 def test_two_clocks_do_not_show_which_one_departs():
