@@ -41,13 +41,13 @@ class Departure:
         return self.offset_s + self.rate * (t_ns - self.t_ns) * 1e-9
 
 
-def clock_gains(P: Array, H: Array, y: Array) -> Array:
-    """(C,) how much less keyframes cost if the clock of one camera alone has any other offset: a rank-one change of
-    the covariance P (8 C, 8 C) of the cameras' errors, of which the keyframes show H e = y."""
+def other_offsets(P: Array, H: Array, y: Array) -> tuple[Array, Array]:
+    """(C,) how much less keyframes cost if the clock of one camera alone has any other offset, and (C,) that offset, s:
+    a rank-one change of the covariance P (8 C, 8 C) of the cameras' errors, of which the keyframes show H e = y."""
     offsets = ERRORS * np.arange(len(y) // ERRORS) + CAUSES["clock"].start
     with_them = np.linalg.solve(np.eye(len(y)) + H @ P, np.column_stack([y, H]))
-    score, information = with_them[:, 0], with_them[:, 1:]
-    return np.asarray(score[offsets] ** 2 / (np.diag(information)[offsets] + CHANGED_SIGMA[0] ** -2), float)
+    score, information = with_them[offsets, 0], np.diag(with_them[:, 1:])[offsets] + CHANGED_SIGMA[0] ** -2
+    return score**2 / information, score / information
 
 
 class ClockWalk:
@@ -133,7 +133,7 @@ class ClockWalk:
             return float(off @ (free - with_them[seen, seen] @ off)), np.asarray(with_them, float)
 
         cost, P = explain(self.P)
-        gain = clock_gains(self.P[seen, seen], H, off)
+        gain, _ = other_offsets(self.P[seen, seen], H, off)
         camera = int(np.argmax(gain))
         if (
             self._n > 2

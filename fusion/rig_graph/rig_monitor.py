@@ -37,7 +37,7 @@ from fusion.model.frames import FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import FrameSetFit, Snapshot
 from fusion.protocol.pose_messages import Contradiction
-from fusion.rig_graph.clock_walk import ClockWalk, Departure, clock_gains
+from fusion.rig_graph.clock_walk import ClockWalk, Departure, other_offsets
 from fusion.rig_graph.hypotheses import (
     CAUSES,
     CONFIRMED,
@@ -105,6 +105,15 @@ class Measured:
     shapes: dict[int, Shape]
 
 
+@dataclass(frozen=True, slots=True)
+class OtherClock:
+    """By how much less keyframes cost if the clock of a camera is off by another offset, either way."""
+
+    camera: int
+    gain: float
+    offset_s: float
+
+
 Judgement = tuple[Window, Verdict, Measured | None]
 
 
@@ -119,7 +128,7 @@ class RigMonitor:
         excluded: names of moved cameras whose poses are not known yet.
         pinned: names of cameras whose poses a user confirmed; these do not change.
         contradicting: names of the cameras of which some are at fault, but the data do not decide which.
-        clock_doubts: by camera, the offset of its clock, s, that a judgement found, until one confirms or refutes it.
+        clock_doubts: by camera, the offset of its clock, s, that keyframes show, until judgements confirm or refute it.
         refines: whether poses, lenses and the places of markers are corrected by what robots show of them.
         is_settled: whether the last `check` judged what contradicts the predictions: no clock is searched for.
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
@@ -128,7 +137,7 @@ class RigMonitor:
     def __init__(self, cameras: CameraArray, markers: MarkerTable) -> None:
         self._cameras, self._markers = cameras, markers
         self._keyframes = Keyframes(cameras, markers, max(WINDOWS))
-        self._job: Future[Judgement | float | None] | None = None
+        self._job: Future[Judgement | OtherClock | None] | None = None
         self._judged = 0  # jobs that were taken since they were asked for
         self._checked_ns = self._revision = self._n_undecided = 0
         self._pause_ns = self._watched_ns = self._watch_pause_ns = 0
@@ -278,9 +287,9 @@ class RigMonitor:
             ):  # of a process that ended, or of a singular system: the next keyframes are others
                 log.exception("the cameras can't be judged")
                 return ()
-            if judged is not None and not isinstance(judged, tuple):
+            if isinstance(judged, OtherClock):
                 self._watch_pause_ns = round((now_ns - self._watched_ns) / WATCH_SHARE)
-                self._gain, self._judged_gain = judged, min(judged, self._judged_gain)
+                self._note_other_clock(judged)
                 return ()
             self._pause_ns = round((now_ns - self._checked_ns) / USUAL_SHARE)
             if judged is None:
@@ -337,7 +346,7 @@ class RigMonitor:
         self._forget()
         return ExtrinsicsCorrection(name, None)
 
-    def _start(self, job: Callable[[], Judgement | float | None]) -> None:
+    def _start(self, job: Callable[[], Judgement | OtherClock | None]) -> None:
         self._job = _done(job) if self.executor is None else self.executor.submit(job)
 
     def _act(
@@ -438,6 +447,11 @@ class RigMonitor:
         for name in names:
             self._use(name)
         return tuple(ExtrinsicsCorrection(name, self._cameras[name], has_returned=True) for name in names)
+
+    def _note_other_clock(self, other: "OtherClock") -> None:
+        self._gain, self._judged_gain = other.gain, min(other.gain, self._judged_gain)
+        if other.gain > chdtri(1, FALSE_ALARM):
+            self.clock_doubts[self._cameras.names[other.camera]] = other.offset_s
 
     def _note_clocks(self, verdict: Verdict, measured: Measured | None) -> None:
         """Add a window that contradicts no pose and no lens to what is known of the clocks.
@@ -634,13 +648,15 @@ def judge_latest(
 
 def watch(
     keyframes: Sequence[Keyframe], cameras: Mapping[str, Camera], error_scale: float, markers: MarkerTable
-) -> float:
-    """How much better keyframes are explained if the clock of one camera, any of them, has another offset, squared
-    standard deviations: velocities of robots explain it to a frame set, and a judgement takes ten times as long."""
+) -> OtherClock:
+    """The clock of which another offset explains keyframes best: velocities of robots explain it to a frame set, and a
+    judgement takes ten times as long."""
     array = CameraArray(dict(cameras), error_scale)
     window, _ = window_of(keyframes, array, markers, may_have_moved=False)
     none = fit(window, Hypothesis.of(None, (), len(window.names)), max_iterations=0)
-    return float(clock_gains(window.covariance(1.0), *none.equations).max())
+    gains, offsets = other_offsets(window.covariance(1.0), *none.equations)
+    k = int(np.argmax(gains))
+    return OtherClock(k, float(gains[k]), abs(float(offsets[k])))
 
 
 def _blames_one_of_three(window: Window, verdict: Verdict) -> bool:

@@ -72,6 +72,22 @@ def test_a_drift_is_judged_before_a_frame_set_contradicts_the_predictions(tmp_pa
 
 
 @pytest.mark.ci
+def test_a_clock_is_uncertain_while_a_judgement_takes_long(tmp_path: Path):
+    """Of 4 s, in which it drifts by 20 ms: meanwhile 14 poses of a live run were wrong by up to 15 mm."""
+    with VirtualArena(tmp_path, small_load(), judging_s=4.0) as arena:
+        arena.wait(8.0)
+        tracker = arena.server.pipeline.tracker
+        assert tracker is not None
+        arena.place("cam2", CameraFault(drift_ppm=5000.0, since_ns=arena.clock.now_ns()))
+        clocks = tracker.monitors.clocks
+        assert _happens(arena, 3.0, lambda: clocks.health()["cam2"].state == "uncertain")
+        arena.judge.forget()
+        arena.wait(2.0)
+        assert arena.judge.wrong == []
+        assert {name for name, clock in clocks.health().items() if clock.state != "correct"} == {"cam2"}
+
+
+@pytest.mark.ci
 def test_one_judgement_is_enough_for_what_it_does_not_change(tmp_path: Path):
     """What keyframes show of a clock, if it does not grow after a judgement, makes none due."""
     with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
