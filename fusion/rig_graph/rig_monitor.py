@@ -3,7 +3,7 @@
 
     frame sets            -> `Keyframes`: with the robots around them
     every second or so    -> `judge`: which hypothesis about the cameras explains the keyframes?
-    between, twice one    -> `watch`: has a clock changed? then they are judged at once
+    twice a second        -> `watch`: has a clock changed? then they are judged at once
     a pose, decided       -> the camera is excluded until its pose is known, then used with it
     undecided             -> the cameras that contradict each other are reported, and all are used as they are
 
@@ -75,7 +75,7 @@ CHECK_NS, SUSPICIOUS_NS = (
 # another one, which are longer than the work.
 USUAL_SHARE, WATCH_SHARE = 0.06, 0.2
 GREW = (
-    1.5  # ratio of what another offset of a clock explains, now and to the last judgement, for the next one
+    1.5  # ratio of what another offset of a clock explains, now and to the last judgement, until the next one
 )
 CHANGED = 2.0  # ratio of the mean robust costs in both halves of a window in which something changed
 USUAL = (
@@ -448,7 +448,7 @@ class RigMonitor:
             self._use(name)
         return tuple(ExtrinsicsCorrection(name, self._cameras[name], has_returned=True) for name in names)
 
-    def _note_other_clock(self, other: "OtherClock") -> None:
+    def _note_other_clock(self, other: OtherClock) -> None:
         self._gain, self._judged_gain = other.gain, min(other.gain, self._judged_gain)
         if other.gain > chdtri(1, FALSE_ALARM):
             self.clock_doubts[self._cameras.names[other.camera]] = other.offset_s
