@@ -49,16 +49,21 @@ class Exposures:
     Attributes:
         camera: (F,) index of the camera.
         tau: (F,) capture time minus the time of the states, seconds.
-        tau_sigma: (F,) its standard deviation, seconds.
-        stamp_sigma: (F,) the part of that by errors of single stamps, seconds.
+        clock_sigma: (F,) its standard deviation by the clock, which frames have in common, seconds.
+        stamp_sigma: (F,) by errors of single stamps, seconds.
         line_s: (F,) time from one row to the next of a rolling shutter, seconds.
     """
 
     camera: Index
     tau: Array
-    tau_sigma: Array
+    clock_sigma: Array
     stamp_sigma: Array
     line_s: Array
+
+    @property
+    def tau_sigma(self) -> Array:
+        """(F,) standard deviation of `tau`, seconds."""
+        return np.hypot(self.clock_sigma, self.stamp_sigma)
 
     @classmethod
     def exact(cls, camera: Index, tau: Array) -> "Exposures":
@@ -322,7 +327,7 @@ class DetectionTable(Columns):
         exposures = Exposures(
             np.array([cameras.index[frame.camera] for frame in frames], np.intp),
             np.array([(frame.t_ns - frame_set.t_ns) * 1e-9 for frame in frames]),
-            np.array([frame.time_sigma_s for frame in frames]),
+            np.array([frame.clock_sigma_s for frame in frames]),
             np.array([frame.stamp_sigma_s for frame in frames]),
             np.array([frame.readout_s / cameras[frame.camera].height for frame in frames]),
         )

@@ -25,8 +25,7 @@ log = logging.getLogger("fusion")
 ClockState = Literal["correct", "uncertain", "corrected"]
 REPORTED_S = 0.0005  # smallest correction that is reported; later ones when it has doubled
 MAX_MOTION_M = 0.005  # of a robot in the standard deviation of a camera's clock, so that it locates the robot
-# Irregularity of stamps: as of good drivers, and half of what is reported.
-REGULAR_S, REPORTED_IRREGULAR_NS = 0.0005, 0.5e6
+REGULAR_S = 0.0005  # standard deviation of the stamps of good drivers, as of calibrated clocks; from twice it reported
 CERTAIN = 3.0  # standard deviations by which a correction may be wrong before a lag contradicts it: 1 in 700
 DECAY_S = 10.0  # of an offset that most corrections have in common: a fault of a clock adds 0.2 ms to it
 MAX_AHEAD_NS = 200_000_000  # of a frame in corrected time, relative to its arrival
@@ -53,7 +52,7 @@ class _Clock:
         stepped_s: the part of the correction that the steps of its stamps show.
         since_ns, now_ns: the time of the last estimate, and of the last frame.
         reported_s: the correction that was last reported.
-        irregular_ns: the standard deviation of single stamps that was last reported.
+        irregular_s: the standard deviation of single stamps that was last reported.
     """
 
     check: StampCheck
@@ -66,7 +65,7 @@ class _Clock:
     since_ns: int = 0
     now_ns: int = 0
     reported_s: float = 0.0
-    irregular_ns: float = REPORTED_IRREGULAR_NS
+    irregular_s: float = REGULAR_S
 
     def at(self, t_ns: int) -> float:
         """The correction at a time, s."""
@@ -83,14 +82,14 @@ class _Clock:
         grown_s = self.rate_sigma * (self.now_ns - self.since_ns) * 1e-9
         return math.hypot(self.sigma_s, grown_s, self.doubt_s)
 
-    def report_irregular(self, name: str) -> None:
+    def report_irregular(self, name: str, sigma_s: float) -> None:
         """Log that stamps are irregular, and again once they are twice as much."""
-        if self.check.sigma_ns > 2 * self.irregular_ns:
-            self.irregular_ns = self.check.sigma_ns
+        if sigma_s > 2 * self.irregular_s:
+            self.irregular_s = sigma_s
             log.warning(
                 "camera %s: its frames have irregular stamps, by %.1f ms, which poses of moving robots claim; let its "
                 "driver state when frames were exposed",
-                *(name, 1e-6 * self.check.sigma_ns),
+                *(name, 1e3 * sigma_s),
                 extra=about(name),
             )
 
@@ -175,7 +174,7 @@ class CameraClocks:
         """A frame in corrected time; None if that time is in the future."""
         name, clock = frame.camera, self._clocks[frame.camera]
         if (irregular_s := min(1e-9 * clock.check.sigma_ns, MAX_CLOCK_ERROR_S)) > REGULAR_S:
-            clock.report_irregular(name)
+            clock.report_irregular(name, irregular_s)
             in_common_s = math.sqrt(max(0.0, frame.clock_sigma_s**2 - irregular_s**2))
             frame = replace(frame, stamp_sigma_s=irregular_s, clock_sigma_s=in_common_s)
         if clock.since_ns or clock.known_s:

@@ -344,8 +344,8 @@ def _since(cameras: CameraArray, exposures: Exposures) -> Array:
     variance = np.tile((FREE_SIGMA * NEGLIGIBLE) ** 2, (len(cameras.names), 1))
     for k, name in enumerate(cameras.names):
         camera = cameras[name]
-        in_common = (exposures.tau_sigma**2 - exposures.stamp_sigma**2)[exposures.camera == k]
-        variance[k, CAUSES["clock"]] += OFFSET_SIGMA_S**2 + in_common.max(initial=0.0)
+        clock_s = exposures.clock_sigma[exposures.camera == k].max(initial=0.0)
+        variance[k, CAUSES["clock"]] += OFFSET_SIGMA_S**2 + clock_s**2
         focal = camera.lens_sigma[0] / camera.fx if camera.lens_sigma is not None else FOCAL_STABILITY
         variance[k, CAUSES["focal"]] += focal**2
     return variance.ravel()

@@ -19,6 +19,7 @@ from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.server import Server
+from fusion.tracking.tracker import Tracker
 from tests.benchmarks.faults.camera import SceneCamera, SceneDetector
 from tests.benchmarks.faults.judge import PoseJudge
 from tests.benchmarks.faults.late_results import LateResults
@@ -134,6 +135,12 @@ class VirtualArena:
             else:
                 self._receive()
         self.clock.t_ns = max(self.clock.t_ns, end_ns)
+
+    @property
+    def tracker(self) -> Tracker:
+        """The server's."""
+        assert self.server.pipeline.tracker is not None  # the arena has a rig
+        return self.server.pipeline.tracker
 
     def place(self, camera: str, fault: CameraFault) -> None:
         """Give a camera other faults."""

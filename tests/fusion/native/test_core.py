@@ -216,7 +216,7 @@ def test_candidates_are_the_pairs_within_the_gates(spread):
     exposures, discs = seen.detections.exposures, seen.discs
     random = np.random.default_rng(3)
     exposures = replace(
-        exposures, tau_sigma=random.uniform(0, 0.05, len(exposures.tau))
+        exposures, clock_sigma=random.uniform(0, 0.05, len(exposures.tau))
     )  # 100 px/s: up to 5 px
     seen = replace(seen, detections=replace(seen.detections, exposures=exposures))
     states = replace(states, P=np.tile(1e-3 * np.eye(12), (BODIES, 1, 1)), v=0.01 * states.v)

@@ -140,8 +140,8 @@ def test_an_offset_that_is_not_significant_is_claimed_and_not_corrected():
 
 
 def test_a_clock_that_departs_leaves_those_certain_that_were_corrected_before():
-    """They were claimed as if each of them alone explained it, by thousands of ppm; where robots were lost meanwhile,
-    nothing was measured any more, and claims grew to 0.1 s."""
+    """They were claimed as if each of them alone explained it, by thousands of ppm; once robots were lost, nothing
+    was measured any more, and claims grew to 0.1 s."""
     walk, next_ns = settled(4, 0, 1, 2)
     walk.update(next_ns, *about_offsets(np.array([0.0, 0.0, 0.0, 0.033])))
     first, *others = walk.take_departures()

@@ -56,8 +56,7 @@ def test_a_drift_is_judged_before_a_frame_set_contradicts_the_predictions(tmp_pa
     judgement blames is uncertain before others confirm that."""
     with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
         arena.wait(5.0)
-        tracker = arena.server.pipeline.tracker
-        assert tracker is not None
+        tracker = arena.tracker
         monitors = tracker.monitors
 
         def begins(within_s: float) -> bool:
@@ -73,11 +72,10 @@ def test_a_drift_is_judged_before_a_frame_set_contradicts_the_predictions(tmp_pa
 
 @pytest.mark.ci
 def test_a_clock_is_uncertain_while_a_judgement_takes_long(tmp_path: Path):
-    """Of 4 s, in which it drifts by 20 ms: meanwhile 14 poses of a live run were wrong by up to 15 mm."""
+    """Of 4 s, in which it drifts by 20 ms. In a live run, 14 poses were wrong by up to 15 mm until the judgement."""
     with VirtualArena(tmp_path, small_load(), judging_s=4.0) as arena:
         arena.wait(8.0)
-        tracker = arena.server.pipeline.tracker
-        assert tracker is not None
+        tracker = arena.tracker
         arena.place("cam2", CameraFault(drift_ppm=5000.0, since_ns=arena.clock.now_ns()))
         clocks = tracker.monitors.clocks
         assert _happens(arena, 3.0, lambda: clocks.health()["cam2"].state == "uncertain")
@@ -92,8 +90,7 @@ def test_one_judgement_is_enough_for_what_it_does_not_change(tmp_path: Path):
     """What keyframes show of a clock, if it does not grow after a judgement, makes none due."""
     with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
         arena.wait(5.0)
-        tracker = arena.server.pipeline.tracker
-        assert tracker is not None
+        tracker = arena.tracker
         rig = tracker.monitors.rig
         for judged, least_ns in ((0.0, CHECK_NS), (10.0, 2 * CHECK_NS)):
             rig._pause_ns, rig._gain, rig._judged_gain = 2 * CHECK_NS, 11.0, judged
@@ -105,8 +102,7 @@ def test_cameras_are_judged_again_soon_while_claims_are_wide(tmp_path: Path):
     """What contradicts is not decided yet. The next judgement began 6 s later, and poses were wrong by 411 mm."""
     with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
         arena.wait(5.0)
-        tracker = arena.server.pipeline.tracker
-        assert tracker is not None
+        tracker = arena.tracker
         tracker.cameras.count_errors(8.0, 0.0)  # as after a judgement that decides nothing
         begun_ns = list[int]()
         for _ in range(50):
@@ -128,8 +124,7 @@ def test_the_newest_keyframes_show_that_a_clock_changed(tmp_path: Path):
 
 def _has_changed(arena: VirtualArena) -> bool:
     """Whether the newest quarter of the keyframes shows other errors of the cameras than all of them."""
-    tracker = arena.server.pipeline.tracker
-    assert tracker is not None
+    tracker = arena.tracker
     keyframes = tuple(tracker.monitors.rig._keyframes.kept)
     window, _ = window_of(keyframes, tracker.cameras, tracker.table.markers)
     found = fit(window, Hypothesis.of(None, (), len(window.names)))
@@ -162,8 +157,7 @@ def test_a_camera_whose_frames_come_late_did_not_move(tmp_path: Path):
     was excluded as moved, and used again 30 mm from its place: poses were wrong by 28 mm."""
     with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
         arena.wait(5.0)
-        tracker = arena.server.pipeline.tracker
-        assert tracker is not None
+        tracker = arena.tracker
         poses = {name: tracker.cameras[name].T_world_cam for name in arena.cameras}
         arena.place("cam2", CameraFault(delay_ms=300.0, since_ns=arena.clock.now_ns()))
         arena.wait(4.0)
@@ -196,8 +190,7 @@ def test_a_camera_that_is_left_alone_contradicts_no_other(tmp_path: Path, caplog
         for name in arena.cameras[1:]:
             arena.place(name, CameraFault(silent=True, since_ns=arena.clock.now_ns()))
         arena.wait(4.0)
-        tracker = arena.server.pipeline.tracker
-        assert tracker is not None
+        tracker = arena.tracker
         assert not tracker.monitors.rig.is_doubtful
         assert "judged" not in caplog.text  # an error: warnings of NumPy are errors here
         assert arena.judge.wrong == []
