@@ -7,6 +7,7 @@ columns: (3, N) for N vectors.
 """
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -156,9 +157,15 @@ class CameraArray:
         """A copy of all cameras by name."""
         return dict(self._cameras)
 
+    def stated(self, error_scale: float) -> "CameraArray":
+        """The cameras as they are now, of which the errors that the rig states count this many times as large."""
+        if (self.error_scale, self.size_error) == (error_scale, 0.0):
+            return copy(self)
+        return CameraArray(self._cameras, error_scale)
+
     def place(self, cameras: Mapping[str, Camera]) -> None:
         """Replace the poses of cameras."""
-        self._cameras |= cameras
+        self._cameras = {**self._cameras, **cameras}
         self.revision += 1
         self._update()
 
@@ -493,3 +500,10 @@ def detection_density(cameras: CameraArray, detections: DetectionTable, frame: I
 def mean_by_body(values: NDArray, body: Index, n_bodies: int) -> Array:
     """(B,) means of values (N,) of the bodies (N,); 0 for bodies without values."""
     return np.bincount(body, values, n_bodies) / np.maximum(np.bincount(body, minlength=n_bodies), 1)
+
+
+def count_checked(robot: Index, camera: Index, n_robots: int) -> Index:
+    """(R,) how many of the detections (N,) of robots by cameras each robot has; 0 where one camera alone sees it."""
+    seen = np.zeros((n_robots, np.max(camera, initial=0) + 1), bool)
+    seen[robot, camera] = True
+    return np.where(seen.sum(1) > 1, np.bincount(robot, minlength=n_robots), 0)

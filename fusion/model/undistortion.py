@@ -55,8 +55,11 @@ def measure(lens: Lens, roundels: Roundels) -> Array:
         (19, N) columns of a `DetectionTable`, without the errors of cameras and without delays. Centres of the
         undistorted ellipses (`camera_node.geometry.outline`) are within `TOLERANCE_PX` of those by `Lens.normalise`;
         they are the undistorted centres where axes are unknown or impossible, and NaN where the lens has no inverse.
+        Covariances contain the error `TOLERANCE_PX` too: cameras may claim that they have hardly any, and equations
+        with such weights are singular.
     """
     columns = table_of(lens).measure(roundels)
+    columns[COV][[0, 3]] += TOLERANCE_PX**2
     if np.isnan(columns[XY.start]).any():
         left = np.flatnonzero(np.isnan(columns[XY.start]))
         uv, outlines = columns[UV, left].T, columns[OUTLINE, left]

@@ -123,7 +123,8 @@ void BodyFit::write_costs(const double* squared, double* costs) const {
 
 void BodyFit::write_covariances(ErrorMatrix* P) const {
     for (size_t b = 0; b < predicted_.size(); ++b)
-        if (of_.first[b] < of_.first[b + 1]) P[b] = inverse(sums_[b]);
+        if (of_.first[b] < of_.first[b + 1])
+            if (const auto inverted = inverse_if_positive(sums_[b])) P[b] = *inverted;
 }
 
 }  // namespace roundel::fusion

@@ -42,7 +42,7 @@ class BodyFit {
     /// Writes the robust cost of each body: of its centres, whose squared residuals are given in standard
     /// deviations (NaN where not visible), and of its displacement from the prediction.
     void write_costs(const double* squared, double* costs) const;
-    /// Writes the covariances of the bodies with observations; throws as `inverse`.
+    /// Writes the covariances of the bodies with observations, except where their systems are singular.
     void write_covariances(ErrorMatrix* P) const;
 
   private:

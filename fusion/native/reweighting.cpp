@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <numbers>
 #include <numeric>
+#include <optional>
 #include <span>
 #include <stdexcept>
 
@@ -154,11 +155,14 @@ double log_ratio(const Evidence& evidence, int64_t body, int64_t camera, const E
     return ratio + explained();
 }
 
-ErrorMatrix inverse(const ErrorMatrix& H) {
+std::optional<ErrorMatrix> inverse_if_positive(const ErrorMatrix& H) {
     const Cholesky<kErrors> factor(H);
-    if (!factor.positive())
-        throw std::runtime_error("the information matrix of a robot is not positive definite");
-    return factor.inverse_tail<kErrors>();
+    return factor.positive() ? std::optional(factor.inverse_tail<kErrors>()) : std::nullopt;
+}
+
+ErrorMatrix inverse(const ErrorMatrix& H) {
+    if (const auto inverted = inverse_if_positive(H)) return *inverted;
+    throw std::runtime_error("the information matrix of a robot is not positive definite");
 }
 
 }  // namespace roundel::fusion

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
 #include <array>
+#include <optional>
 
 #include "linearization.hpp"
 
@@ -55,7 +56,10 @@ struct Evidence {
 /// those that are and the covariance P of its prediction, minus that as any roundels of their images.
 double log_ratio(const Evidence& evidence, int64_t body, int64_t camera, const ErrorMatrix& P);
 
-/// The inverse of a positive definite matrix. Throws std::runtime_error for other matrices.
+/// The inverse of a positive definite matrix.
+std::optional<ErrorMatrix> inverse_if_positive(const ErrorMatrix& H);
+
+/// The same; throws std::runtime_error for other matrices.
 ErrorMatrix inverse(const ErrorMatrix& H);
 
 }  // namespace roundel::fusion

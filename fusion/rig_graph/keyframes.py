@@ -30,6 +30,7 @@ from fusion.model.observations import (
     Exposures,
     MarkerTable,
     MatchedObservations,
+    count_checked,
 )
 from fusion.model.states import Snapshot, States
 from fusion.rig_graph.hypotheses import CAUSES, FREE_SIGMA, INTERVAL_NS, RIVAL, Window
@@ -333,9 +334,7 @@ def is_significant(velocity: Array, sigma: Array) -> Mask:
 
 def _are_determined(robot: Index, camera: Index) -> Mask:
     """(N,) detections of robots that two cameras or more see, and that have `MIN_SEEN` detections."""
-    n = int(np.max(robot, initial=0)) + 1
-    views = np.unique(np.stack([robot, camera]), axis=1)[0]
-    determined = (np.bincount(views, minlength=n) >= 2) & (np.bincount(robot, minlength=n) >= MIN_SEEN)
+    determined: Mask = count_checked(robot, camera, int(np.max(robot, initial=0)) + 1) >= MIN_SEEN
     return determined[robot]
 
 

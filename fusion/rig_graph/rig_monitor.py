@@ -105,11 +105,11 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class OtherClock:
-    """By how much less keyframes cost if the clock of a camera is off by another offset, either way."""
+    """By how much less keyframes cost if one clock has another offset; and these offsets, s, either way, by camera: of
+    the best and of all that explain as much but for chance, as both of two cameras do."""
 
-    camera: int
     gain: float
-    offset_s: float
+    offsets_s: dict[int, float]
 
 
 Judgement = tuple[Window, Verdict, Measured | None]
@@ -151,7 +151,7 @@ class RigMonitor:
         self._was_doubtful = False
         self._moments: deque[tuple[FrameSet, Snapshot]] = deque()
         self._moved: set[str] = set()  # the excluded cameras that showed most markers elsewhere
-        self._given: tuple[dict[str, Camera], float, MarkerTable] = {}, 1.0, markers  # to the job
+        self._given = cameras, markers  # to the job
         self._is_confirmed = False  # whether the job confirms a judgement
         self._is_of_wand = False  # whether what contradicts is the size of the rig
         self._size_m = 0.0  # of what contradicts, at the robots
@@ -306,7 +306,7 @@ class RigMonitor:
             return
         if not any(len(keyframe.views) > 1 for keyframe in kept[-min(WINDOWS) :]):
             return  # one camera contradicts no other
-        scene = self._cameras.as_dict(), self._scale, self._markers  # of this time
+        scene = self._cameras.stated(self._scale), self._markers
         self._revision = self._cameras.revision
         if now_ns >= self._checked_ns + self._wait_ns:
             self._checked_ns = self._watched_ns = now_ns
@@ -449,7 +449,7 @@ class RigMonitor:
     def _note_other_clock(self, other: OtherClock) -> None:
         self._gain, self._judged_gain = other.gain, min(other.gain, self._judged_gain)
         if other.gain > chdtri(1, FALSE_ALARM):
-            self.clock_doubts[self._cameras.names[other.camera]] = other.offset_s
+            self.clock_doubts |= {self._cameras.names[k]: offset_s for k, offset_s in other.offsets_s.items()}
 
     def _note_clocks(self, verdict: Verdict, measured: Measured | None) -> None:
         """Add a window that contradicts no pose and no lens to what is known of the clocks.
@@ -623,8 +623,7 @@ def _run(future: "Future[T]", job: Callable[[], T]) -> None:
 
 def judge_latest(
     keyframes: Sequence[Keyframe],
-    cameras: Mapping[str, Camera],
-    error_scale: float,
+    cameras: CameraArray,
     markers: MarkerTable,
     shapes: RobotShapes,
     since_ns: int,
@@ -632,11 +631,10 @@ def judge_latest(
 ) -> Judgement | None:
     """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
     errors of cameras and the shapes of robots is measured."""
-    array = CameraArray(dict(cameras), error_scale)
     for n in WINDOWS:
         if n <= len(keyframes):
-            window, starts = window_of(keyframes[-n:], array, markers)
-            verdict = judge(window, starts, [array.index[name] for name in moved])
+            window, starts = window_of(keyframes[-n:], cameras, markers)
+            verdict = judge(window, starts, [cameras.index[name] for name in moved])
             newest = np.arange(n) >= n - min(WINDOWS)
             is_constant = newest.all() or not has_changed(window, verdict.fit, newest)
             if is_constant and verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
@@ -644,17 +642,14 @@ def judge_latest(
     return None
 
 
-def watch(
-    keyframes: Sequence[Keyframe], cameras: Mapping[str, Camera], error_scale: float, markers: MarkerTable
-) -> OtherClock:
-    """The clock of which another offset explains keyframes best: velocities of robots explain it to a frame set, and a
+def watch(keyframes: Sequence[Keyframe], cameras: CameraArray, markers: MarkerTable) -> OtherClock:
+    """The clocks of which another offset explains keyframes best: velocities of robots explain it to a frame set, and a
     judgement takes ten times as long."""
-    array = CameraArray(dict(cameras), error_scale)
-    window, _ = window_of(keyframes, array, markers, may_have_moved=False)
+    window, _ = window_of(keyframes, cameras, markers, may_have_moved=False)
     none = fit(window, Hypothesis.of(None, (), len(window.names)), max_iterations=0)
     gains, offsets = other_offsets(window.covariance(1.0), *none.equations)
-    k = int(np.argmax(gains))
-    return OtherClock(k, float(gains[k]), abs(float(offsets[k])))
+    likely = np.flatnonzero(gains > gains.max() - chdtri(1, RIVAL))
+    return OtherClock(float(gains.max()), {int(k): abs(float(offsets[k])) for k in likely})
 
 
 def _blames_one_of_three(window: Window, verdict: Verdict) -> bool:
@@ -663,14 +658,13 @@ def _blames_one_of_three(window: Window, verdict: Verdict) -> bool:
 
 def confirm(
     judged: Judgement,
-    cameras: Mapping[str, Camera],
-    error_scale: float,
+    cameras: CameraArray,
     markers: MarkerTable,
     moments: Sequence[tuple[FrameSet, Snapshot]],
 ) -> Judgement:
     """The judgement that one of three cameras is at fault if `moments` show that it moved; else an undecided one."""
-    (window, verdict, measured), scene = judged, (CameraArray(dict(cameras), error_scale), markers)
-    if moments and _moved_alone(Moments(*zip(*moments, strict=True)), scene, window, verdict):
+    window, verdict, measured = judged
+    if moments and _moved_alone(Moments(*zip(*moments, strict=True)), (cameras, markers), window, verdict):
         return judged
     undecided = replace(verdict, cause=None, cameras=tuple(np.unique(window.camera).tolist()))
     return window, undecided, measured

@@ -98,9 +98,6 @@ class Estimator:
 
         Returns:
             the states, and the squared residuals (N,), px^2, NaN where the disc is not visible.
-
-        Raises:
-            RuntimeError: the system of a body is singular (from GTSAM or the native core).
         """
         fitted = self.fit(prediction, self.prepared(prediction.states, observations), small)
         return fitted.states, fitted.squared_px
@@ -253,7 +250,18 @@ def _estimates(fit: _core.BodyFit, P: Array) -> States:
 
 
 def _eliminate(information: Array, right: Array) -> Array:
-    """(K, 12) corrections of K bodies by one elimination."""
+    """(K, 12) corrections of K bodies by one elimination; none of those whose systems are singular, as of a body that
+    wrong detections moved next to a camera: it does not fit, and stays as predicted."""
+    try:
+        return _solve(information, right)
+    except RuntimeError:
+        if len(right) == 1:
+            return np.zeros((1, 12))
+    each = [slice(k, k + 1) for k in range(len(right))]
+    return np.concatenate([_eliminate(information[k], right[k]) for k in each])
+
+
+def _solve(information: Array, right: Array) -> Array:
     graph = gtsam.GaussianFactorGraph()
     for k, (H, g) in enumerate(zip(information, right, strict=True)):
         graph.push_back(gtsam.HessianFactor(k, H, g, 0.0))

@@ -9,8 +9,8 @@ Tardos 2001). Only pairs are used that all labelings have whose probability is n
 the model explains none, as with errors of cameras that the rig does not state, or a robot that was carried, it can't
 compare them, and the detections stay as they were assigned.
 
-Where a rotation is not known to half a radian, detections of one camera alone are not used: nothing would show that
-they are labeled wrongly.
+Where a rotation is not known to half a radian, or a robot may be elsewhere, detections are only used if they check each
+other: otherwise nothing would show that they are labeled wrongly, or those of another robot.
 """
 
 from dataclasses import dataclass, replace
@@ -27,6 +27,7 @@ from fusion.model.observations import (
     DetectionTable,
     MarkerTable,
     MatchedObservations,
+    count_checked,
     detection_density,
 )
 from fusion.tracking.estimator import Estimator, Prediction
@@ -150,7 +151,7 @@ def choose_labelings(
     estimator: Estimator,
     markers: MarkerTable,
     prediction: Prediction,
-    unknown: Mask,
+    needed: Index,
     detections: DetectionTable,
     assignments: Assignments,
     labelings: Labelings,
@@ -161,12 +162,13 @@ def choose_labelings(
         estimator: of all robots.
         markers: of all robots.
         prediction: of all robots.
-        unknown: (R,) robots that one camera alone does not locate; see `TrackTable.is_rotation_unknown`.
+        needed: (R,) see `TrackTable.needed_detections`.
         detections: of a frame set.
         assignments: of the frame set.
         labelings: others that may be right.
     """
-    assignments = _without_unchecked(markers, detections, assignments, unknown)
+    robot, camera = markers.robot[assignments.marker], detections.camera[assignments.detection]
+    assignments = assignments.select(~are_unchecked(needed, robot, camera)[robot])
     others = labelings.select(np.isin(labelings.robot, markers.robot[assignments.marker]))
     if not len(others):
         return assignments
@@ -191,16 +193,10 @@ def choose_labelings(
     return assignments.select(~_is_undecided(markers, detections, assignments, others.select(margins < GATE)))
 
 
-def _without_unchecked(
-    markers: MarkerTable, detections: DetectionTable, assignments: Assignments, unknown: Mask
-) -> Assignments:
-    """Without those of robots of unknown rotation that one camera alone sees."""
-    if not unknown.any():
-        return assignments
-    robot, camera = markers.robot[assignments.marker], detections.camera[assignments.detection]
-    seen = np.zeros((len(unknown), np.max(camera, initial=0) + 1), bool)
-    seen[robot, camera] = True
-    return assignments.select(~(unknown & (seen.sum(1) == 1))[robot])
+def are_unchecked(needed: Index, robot: Index, camera: Index) -> Mask:
+    """(R,) robots that have fewer of these detections (N,) by two cameras than they need."""
+    unchecked: Mask = needed > 0
+    return unchecked & (count_checked(robot, camera, len(needed)) < needed) if unchecked.any() else unchecked
 
 
 def _margins(

@@ -31,6 +31,7 @@ from fusion.model.undistortion import COV
 from fusion.monitoring.residual_monitor import LEARNED, ResidualMonitor, camera_at_fault
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
+from fusion.tracking.labelings import are_unchecked
 from fusion.tracking.rays import GATE
 
 # Squared residual over that of calibration errors, from which a robot's detections are compared.
@@ -48,6 +49,7 @@ class RobustFit:
 
     Attributes:
         prediction: the robots before the update.
+        needed: (R,) see `TrackTable.needed_detections`.
         detections: of the frame set.
         observations, equations, weights: of the assignments, row by row, with the noise that the fit gives them; see
             `BodyFit`.
@@ -58,6 +60,7 @@ class RobustFit:
     states: States
     assignments: Assignments
     prediction: Prediction
+    needed: Index
     detections: DetectionTable
     observations: MatchedObservations
     equations: Array
@@ -98,10 +101,11 @@ class RobustUpdate:
         self._residuals, self._left_out, self.added_px2 = ResidualMonitor(), None, 0.0
 
     def update(
-        self, prediction: Prediction, detections: DetectionTable, assignments: Assignments
+        self, prediction: Prediction, needed: Index, detections: DetectionTable, assignments: Assignments
     ) -> RobustFit:
-        """The updated states, and the assignments that fit."""
-        fitted = self._fit(prediction, detections, assignments)
+        """The updated states, and the assignments that fit; `needed` as of `RobustFit`."""
+        scene = prediction, needed, detections
+        fitted = self._fit(*scene, assignments)
         if self.added_px2:
             self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
         if (again := self._left_out_again(fitted, assignments)) is not None:
@@ -109,7 +113,7 @@ class RobustUpdate:
         elif not self._is_unusual(fitted):
             self._left_out = None
             if self.added_px2:
-                fitted = self._fit(prediction, detections, assignments, self.added_px2)
+                fitted = self._fit(*scene, assignments, self.added_px2)
             else:
                 self._residuals.learn(fitted.assignments.squared_px, fitted.cost, fitted.count)
         else:
@@ -127,11 +131,13 @@ class RobustUpdate:
     def _fit(
         self,
         prediction: Prediction,
+        needed: Index,
         detections: DetectionTable,
         assignments: Assignments,
         added_px2: float = 0.0,
     ) -> RobustFit:
-        """The updated states; a robot that its detections contradict stays as predicted and loses them."""
+        """The updated states; a robot that its detections contradict stays as predicted and loses them, as does one
+        whose prediction does not check them, if they contradict each other or are too few."""
         noisy = detections
         if added_px2:
             noisy = detections.replaced(COV, detections.cov + added_px2 * np.eye(2)[:, :, None])
@@ -141,7 +147,8 @@ class RobustUpdate:
         states, assignments = fitted.states, assignments.with_residuals(fitted.squared_px)
         body, n = observations.discs.body, len(prediction.states)
         is_large = observations.misfit(fitted.squared_px) > MAX_CHI2
-        contradicted = mean_by_body(is_large, body, n) > CONTRADICTED
+        contradicted = mean_by_body(is_large, body, n) > np.where(needed, 0.0, CONTRADICTED)
+        contradicted |= are_unchecked(needed, body, observations.detections.camera)
         rows, equations, weights = np.flatnonzero(contradicted), fitted.equations, fitted.weights
         if len(rows):
             states = states.with_rows(rows, prediction.states.select(rows))
@@ -149,12 +156,23 @@ class RobustUpdate:
             assignments, observations = assignments.select(kept), observations.select(kept)
             equations, weights = equations[kept], weights[kept]
         count = np.bincount(body, minlength=n)
-        fit = assignments, prediction, detections, observations, equations, weights, fitted.cost, count
+        fit = (
+            assignments,
+            prediction,
+            needed,
+            detections,
+            observations,
+            equations,
+            weights,
+            fitted.cost,
+            count,
+        )
         return RobustFit(states, *fit, added_px2)
 
     def _without(self, k: int, fitted: RobustFit, assignments: Assignments) -> RobustFit:
         camera = fitted.detections.camera[assignments.detection]
-        return self._fit(fitted.prediction, fitted.detections, assignments.select(camera != k))
+        scene = fitted.prediction, fitted.needed, fitted.detections
+        return self._fit(*scene, assignments.select(camera != k))
 
     def _left_out_again(self, fitted: RobustFit, assignments: Assignments) -> RobustFit | None:
         """The fit without the camera that was left out before, while that one does not agree with it."""
@@ -177,9 +195,8 @@ class RobustUpdate:
     def _with_noise(self, fitted: RobustFit, assignments: Assignments) -> RobustFit:
         """The fit with as much noise as makes it usual, no less than the frame set before had."""
         self.added_px2 = max(self.added_px2, self._least_px2(fitted))
-        while self._is_unusual(
-            again := self._fit(fitted.prediction, fitted.detections, assignments, self.added_px2)
-        ):
+        scene = fitted.prediction, fitted.needed, fitted.detections
+        while self._is_unusual(again := self._fit(*scene, assignments, self.added_px2)):
             self.added_px2 *= 2
             if self.added_px2 > MAX_ADDED_PX2:
                 break

@@ -168,10 +168,10 @@ class Tracker:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
         detections, all_assigned, labelings = associated.association.collect(self._used(frame_set))
-        unknown = self.table.is_rotation_unknown(associated.prediction.states)
-        scene = self.estimator, self.table.markers, associated.prediction, unknown, detections
+        needed = self.table.needed_detections(associated.prediction.states)
+        scene = self.estimator, self.table.markers, associated.prediction, needed, detections
         all_assigned = choose_labelings(*scene, all_assigned, labelings)
-        assignments = self._update_states(associated, detections, all_assigned)
+        assignments = self._update_states(associated, needed, detections, all_assigned)
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
@@ -259,12 +259,17 @@ class Tracker:
         return ObservationSummary.of(self.cameras, table.markers, len(table.robots), detections, assignments)
 
     def _update_states(
-        self, associated: AssociatedFrames, detections: DetectionTable, assignments: Assignments
+        self,
+        associated: AssociatedFrames,
+        needed: Index,
+        detections: DetectionTable,
+        assignments: Assignments,
     ) -> Assignments:
         """Update the states of the robots; returns the assignments that fit, with residuals."""
         prediction, tracked = associated.prediction, associated.tracked
         given = AssignedFrames(prediction.states, tracked, detections, assignments)
-        fitted = self.robust.update(prediction, detections, assignments.select(self.own.are_own(given)))
+        own = assignments.select(self.own.are_own(given))
+        fitted = self.robust.update(prediction, needed, detections, own)
         self.table.states = fitted.states
         self.rig_response.update(fitted)
         self._claim()

@@ -12,6 +12,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import half_axes_of
 from fusion.model.undistortion import (
+    COV,
     MAX_CELLS,
     SCALE,
     TOLERANCE_PX,
@@ -127,3 +128,9 @@ def test_the_largest_image_has_a_small_table():
     known = np.isfinite(xy[0])
     assert known.mean() > 0.9
     np.testing.assert_allclose(xy[:, known].T, lens.normalise(uv[known]), atol=2 * TOLERANCE_PX / 3e4)
+
+
+def test_no_detection_is_more_certain_than_the_table():
+    """A camera that claims 1e-8 px made the equations of a robot singular: a replay ended with an exception."""
+    columns = measure(LENSES["usual"], Roundels.from_points(np.array([[300.0, 200.0]]), 1e-8))
+    assert np.linalg.eigvalsh(columns[COV, 0].reshape(2, 2)).min() >= TOLERANCE_PX**2

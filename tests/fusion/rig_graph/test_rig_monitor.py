@@ -5,6 +5,7 @@ import contextlib
 import os
 import signal
 from concurrent.futures import BrokenExecutor
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -14,9 +15,11 @@ from scipy.stats import chi2
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame
-from fusion.model.states import POSITION
-from fusion.rig_graph.hypotheses import CAUSES, Verdict
-from fusion.rig_graph.rig_monitor import JudgeProcess
+from fusion.model.observations import MarkerTable
+from fusion.model.states import POSITION, Snapshot
+from fusion.rig_graph.hypotheses import CAUSES, RIVAL, Verdict
+from fusion.rig_graph.keyframes import Keyframes
+from fusion.rig_graph.rig_monitor import WINDOWS, JudgeProcess, watch
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.trust import Case, run
@@ -264,6 +267,26 @@ def test_a_clock_that_a_judgement_blames_is_in_doubt_until_others_confirm_it():
     assert monitors.rig.clock_doubts == {name: 0.012}
     monitors.rig.readmit(name)  # what it was judged by was an old pose
     assert not monitors.rig.clock_doubts
+
+
+@pytest.mark.parametrize(("n_cameras", "doubted"), [(2, {0, 1}), (4, {1})])
+def test_clocks_that_explain_keyframes_alike_are_in_doubt_together(n_cameras: int, doubted: set[int]):
+    """The stamps of cam1 jump by 10 ms: two cameras show only the difference of their clocks."""
+    arena = Arena(ROBOTS, MOTIONS, cameras=dict(list(ring().items())[:n_cameras]), sigma_px=0.1)
+    tracker, synchronizer = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS)
+    markers = MarkerTable.of(list(ROBOTS.values()))
+    keyframes = Keyframes(tracker.cameras, markers, min(WINDOWS))
+    for frame in arena.frames(90):
+        jumped = frame.camera == "cam1" and arena.seconds(frame.t_ns) > 1.0
+        synchronizer.add(replace(frame, t_ns=frame.t_ns + 10_000_000 * jumped))
+        for frame_set in synchronizer.take(frame.t_ns):
+            tracker.track(frame_set)
+            robots = tracker.table
+            keyframes.add(frame_set, Snapshot(frame_set.t_ns, robots.states, robots.located))
+    other = watch(tuple(keyframes.kept), tracker.cameras, markers)
+    assert other.gain > chi2.isf(RIVAL, 1)
+    assert set(other.offsets_s) == doubted
+    assert other.offsets_s[1] == pytest.approx(0.01, rel=0.2)
 
 
 def test_a_process_that_judges_is_started_again_after_it_was_killed():

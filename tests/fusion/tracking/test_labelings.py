@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Where a prediction does not tell the markers of a robot apart, its detections are labeled jointly, or not used."""
 
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fusion.model.frames import FrameSet
+from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import Assignments, DetectionTable
 from fusion.model.states import States
 from fusion.server.frame_synchronizer import FrameSynchronizer
@@ -63,9 +64,12 @@ def test_frames_that_arrive_in_bursts_make_no_pose_wrong(
         assert arena.judge.wrong == []
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
-def test_of_an_unknown_rotation_one_camera_alone_says_nothing(cameras: int):
-    """After 0.27 s without frames a rotation is known to a radian (one sigma)."""
+@pytest.mark.parametrize(
+    ("cameras", "off_px", "is_used"), [(1, 0.0, False), (2, 0.0, True), (2, 15.0, False)]
+)
+def test_of_an_unknown_rotation_one_camera_alone_says_nothing(cameras: int, off_px: float, is_used: bool):
+    """After 0.27 s without frames a rotation is known to a radian (one sigma). Nor do two that contradict each other:
+    robots that had one of them left out were wrong by 0.6 to 2 m, on a machine that dropped most frames."""
     arena = Arena({"a": TRIANGLE}, {"a": line((0.0, 0.0, 0.2))}, sigma_px=0.1)
     tracker, synchronizer = Tracker(arena.cameras, arena.robots), FrameSynchronizer(PERIOD_NS)
     for frame in arena.frames(20):
@@ -77,10 +81,12 @@ def test_of_an_unknown_rotation_one_camera_alone_says_nothing(cameras: int):
     assert len(seen) == cameras
     predicted = tracker.predict(sets[-1].t_ns)
     assert predicted.tracked.all()
-    assert tracker.table.is_rotation_unknown(predicted.prediction.states).all()
+    assert tracker.table.needed_detections(predicted.prediction.states) == [4]
+    moved = replace(seen[-1].roundels, uv=seen[-1].roundels.uv + off_px)
+    seen[-1] = CalibratedFrame.measure(seen[-1].camera, seen[-1].t_ns, moved, arena.cameras[seen[-1].camera])
     last = FrameSet(sets[-1].t_ns, tuple(seen))
     update = tracker.update(tracker.associate(predicted, last), last)
-    assert (len(update.assignments) > 0) == (cameras > 1)
+    assert (update.poses[0].state == "tracked") == is_used
 
 
 def test_a_robot_is_not_acquired_by_an_improbable_motion(monkeypatch: pytest.MonkeyPatch):

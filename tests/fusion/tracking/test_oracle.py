@@ -21,7 +21,7 @@ from fusion._core import CAUCHY, NOMINAL_WEIGHT
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray, DetectionTable, Discs, MatchedObservations
 from fusion.model.states import States
-from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.estimator import Estimator, Prediction, _eliminate
 from tests.fusion.synthetic import ring
 
 CAMERAS = ring(distortion=(-0.1, 0.02, 0.0003, -0.0002))  # the terms of GTSAM's Cal3DS2
@@ -130,3 +130,14 @@ def turned(predicted: States) -> np.ndarray:
     """(6, 6) covariance of the prior in the tangent space of X."""
     J = np.linalg.inv(by_robot(gtsam.Pose3(gtsam.Rot3(predicted.R[0]), predicted.p[0])))
     return J @ predicted.P[0, :6, :6] @ J.T
+
+
+def test_a_body_whose_equations_are_singular_stays_and_the_others_do_not():
+    """As one that wrong detections moved next to a camera: GTSAM refuses the equations of all."""
+    regular = np.diag(np.linspace(1.0, 2.0, 12))
+    singular = regular.copy()
+    singular[-1, -1] = 0.0
+    right = np.ones((3, 12))
+    steps = _eliminate(np.stack([regular, singular, regular]), right)
+    np.testing.assert_allclose(steps[[0, 2]], right[[0, 2]] / np.diag(regular))
+    assert not steps[1].any()
