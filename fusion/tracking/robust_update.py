@@ -3,8 +3,9 @@
 
 A robot that its detections contradict keeps its prediction. If the fits of most robots contradict their predictions,
 the camera that causes this is left out of the frame set (`residual_monitor`). If none is found, the noise of all
-detections grows until the fits agree with the predictions: robots hold to these, and claim less. Then detections are
-left out that contradict the others of their robot (joint compatibility).
+detections grows until the fits agree with the predictions: robots hold to these, and claim less. Where many detections
+of a robot contradict the others, the view of one camera is left out that explains this, as one in which markers were
+taken for each other. Then detections are left out that contradict the others of their robot (joint compatibility).
 
 Association gates each detection alone: the prediction may be off by a centimetre, and the gates are as wide. But that
 error is common to all markers of a robot. Once some detections determine it, the others must lie within noise and
@@ -41,6 +42,7 @@ SUSPICIOUS = 4.0
 MIN_CORRECTION = 0.5
 MAX_ADDED_PX2 = 32.0**2  # noise that makes anything usual within the gates of association
 CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
+A_VIEW = 0.25  # the same, from which the view of a camera may be wrong: most robots are seen by four or fewer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,9 +53,11 @@ class RobustFit:
         prediction: the robots before the update.
         needed: (R,) see `TrackTable.needed_detections`.
         detections: of the frame set.
+        given: the assignments that were fitted, also those that do not fit.
         observations, equations, weights: of the assignments, row by row, with the noise that the fit gives them; see
             `BodyFit`.
         cost, count: (R,) of each robot: its fit, as of `BodyFit`, and its detections.
+        contradicting: (R,) share of these with a large misfit.
         added_px2: variance that the fit gave the detections beside their own noise.
     """
 
@@ -62,11 +66,13 @@ class RobustFit:
     prediction: Prediction
     needed: Index
     detections: DetectionTable
+    given: Assignments
     observations: MatchedObservations
     equations: Array
     weights: Array
     cost: Array
     count: Index
+    contradicting: Array
     added_px2: float
 
 
@@ -118,7 +124,7 @@ class RobustUpdate:
                 self._residuals.learn(fitted.assignments.squared_px, fitted.cost, fitted.count)
         else:
             fitted = self._leave_one_out(fitted, assignments) or self._with_noise(fitted, assignments)
-        return self._without_incompatible(fitted)
+        return self._without_incompatible(self._without_wrong_views(fitted))
 
     @staticmethod
     def _least_px2(fitted: RobustFit) -> float:
@@ -144,30 +150,33 @@ class RobustUpdate:
         observations = MatchedObservations.of(assignments, noisy, self._markers)
         observations = self._estimator.prepared(prediction.states, observations)
         fitted = self._estimator.fit(prediction, observations)
-        states, assignments = fitted.states, assignments.with_residuals(fitted.squared_px)
+        states, fits = fitted.states, assignments.with_residuals(fitted.squared_px)
         body, n = observations.discs.body, len(prediction.states)
         is_large = observations.misfit(fitted.squared_px) > MAX_CHI2
-        contradicted = mean_by_body(is_large, body, n) > np.where(needed, 0.0, CONTRADICTED)
+        share = mean_by_body(is_large, body, n)
+        contradicted = share > np.where(needed, 0.0, CONTRADICTED)
         contradicted |= are_unchecked(needed, body, observations.detections.camera)
         rows, equations, weights = np.flatnonzero(contradicted), fitted.equations, fitted.weights
         if len(rows):
             states = states.with_rows(rows, prediction.states.select(rows))
             kept = ~contradicted[body]
-            assignments, observations = assignments.select(kept), observations.select(kept)
+            fits, observations = fits.select(kept), observations.select(kept)
             equations, weights = equations[kept], weights[kept]
-        count = np.bincount(body, minlength=n)
-        fit = (
-            assignments,
-            prediction,
-            needed,
-            detections,
-            observations,
-            equations,
-            weights,
-            fitted.cost,
-            count,
+        return RobustFit(
+            states=states,
+            assignments=fits,
+            prediction=prediction,
+            needed=needed,
+            detections=detections,
+            given=assignments,
+            observations=observations,
+            equations=equations,
+            weights=weights,
+            cost=fitted.cost,
+            count=np.bincount(body, minlength=n),
+            contradicting=share,
+            added_px2=added_px2,
         )
-        return RobustFit(states, *fit, added_px2)
 
     def _without(self, k: int, fitted: RobustFit, assignments: Assignments) -> RobustFit:
         camera = fitted.detections.camera[assignments.detection]
@@ -201,6 +210,32 @@ class RobustUpdate:
             if self.added_px2 > MAX_ADDED_PX2:
                 break
         return again
+
+    def _without_wrong_views(self, fitted: RobustFit) -> RobustFit:
+        """The fit without the views that explain why many detections of a robot contradict the others, if one camera
+        does, far better than any other. Where those of most robots do, the rig has errors that it does not state."""
+        doubtful = np.flatnonzero(fitted.contradicting >= A_VIEW)
+        if not len(doubtful) or np.median(fitted.contradicting[fitted.count > 0]) > 0:
+            return fitted
+        scene, given = (fitted.prediction, fitted.needed, fitted.detections), fitted.given
+        robot, camera = self._markers.robot[given.marker], fitted.detections.camera[given.detection]
+        seen = np.zeros((len(fitted.contradicting), np.max(camera) + 1), bool)
+        seen[robot, camera] = True
+        is_doubtful, wrong = np.isin(robot, doubtful), np.zeros_like(seen)
+        costs = {
+            k: self._fit(*scene, given.select(is_doubtful & (camera != k)), fitted.added_px2).cost
+            for k in np.flatnonzero(seen[doubtful].any(0)).tolist()
+        }
+        for row in doubtful.tolist():
+            without = {k: float(costs[k][row]) for k in np.flatnonzero(seen[row]).tolist()}
+            k = camera_at_fault(float(fitted.cost[row]), without)
+            if k is not None:
+                wrong[row, k] = True
+        return (
+            self._fit(*scene, given.select(~wrong[robot, camera]), fitted.added_px2)
+            if wrong.any()
+            else fitted
+        )
 
     def _without_incompatible(self, fitted: RobustFit) -> RobustFit:
         """The fit to detections that do not contradict the others of their robots; all keep their residuals.

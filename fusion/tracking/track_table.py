@@ -124,8 +124,9 @@ class TrackTable:
         return self.alive & ((position2 < ASSOCIATED_M**2) & ~rotated | self._seen)
 
     def needed_detections(self, predicted: States) -> Index:
-        """(N,) how many detections, by two cameras, each robot needs because its prediction does not check them: more
-        than determine its pose, since any roundels fit that many. 0 where the prediction does, or a code.
+        """(N,) how many detections, by two cameras, each robot needs because its prediction does not check them: as
+        many as determine its pose and velocity, since frames of different times show any roundels to fit fewer. 0 where
+        the prediction does, or a code.
 
         It does not where the rotation does not tell markers apart, or the robot may have moved so far since the last
         frame set that the detections near it are those of others.
@@ -133,7 +134,7 @@ class TrackTable:
         rotation2 = np.einsum("nii->n", predicted.P[:, THETA, THETA]) / 3
         moved2 = np.einsum("nii->n", (predicted.P - self.states.P)[:, POSITION, POSITION]) / 3
         vague = (rotation2 > UNKNOWN_RAD**2) & ~self.single | (moved2 > ASSOCIATED_M**2)
-        return np.where(vague & ~self.coded, np.where(self.single, 2, 4), 0)
+        return np.where(vague & ~self.coded, np.where(self.single, 3, 6), 0)
 
     def history_chi2(self, k: int, p: Array, covariance: Array) -> float:
         """Squared Mahalanobis distance of p from robot k's last position, or from its start if never acquired."""

@@ -39,6 +39,19 @@ def test_slow_cameras_exchange_no_markers(tmp_path: Path, seed: int):
 
 
 @pytest.mark.ci
+def test_cameras_of_seven_frames_a_second_exchange_no_robots(tmp_path: Path):
+    """In 0.14 s robots move by 0.17 m (one sigma). Before, one took the detections of another and was 3.2 m off, and
+    one followed a view with exchanged markers, against all others."""
+    load = Load(robots=10, cameras=4, hz=7.0, speed_m_s=0.5)
+    with VirtualArena(tmp_path, load, 3) as arena:
+        arena.wait(4.0)
+        arena.judge.forget()
+        arena.wait(36.0)
+        assert arena.judge.count > 0.99 * 7 * 36 * load.robots
+        assert arena.judge.wrong == []
+
+
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("seed", "silent_s", "seconds"),
     [
@@ -68,8 +81,9 @@ def test_frames_that_arrive_in_bursts_make_no_pose_wrong(
     ("cameras", "off_px", "is_used"), [(1, 0.0, False), (2, 0.0, True), (2, 15.0, False)]
 )
 def test_of_an_unknown_rotation_one_camera_alone_says_nothing(cameras: int, off_px: float, is_used: bool):
-    """After 0.27 s without frames a rotation is known to a radian (one sigma). Nor do two that contradict each other:
-    robots that had one of them left out were wrong by 0.6 to 2 m, on a machine that dropped most frames."""
+    """After 0.27 s without frames a rotation is known to a radian (one sigma). Nor do the rest once a camera is left
+    out that contradicts them, if they are too few: robots were wrong by 0.6 to 2 m, on a machine that dropped most
+    frames."""
     arena = Arena({"a": TRIANGLE}, {"a": line((0.0, 0.0, 0.2))}, sigma_px=0.1)
     tracker, synchronizer = Tracker(arena.cameras, arena.robots), FrameSynchronizer(PERIOD_NS)
     for frame in arena.frames(20):
@@ -81,7 +95,7 @@ def test_of_an_unknown_rotation_one_camera_alone_says_nothing(cameras: int, off_
     assert len(seen) == cameras
     predicted = tracker.predict(sets[-1].t_ns)
     assert predicted.tracked.all()
-    assert tracker.table.needed_detections(predicted.prediction.states) == [4]
+    assert tracker.table.needed_detections(predicted.prediction.states) == [6]
     moved = replace(seen[-1].roundels, uv=seen[-1].roundels.uv + off_px)
     seen[-1] = CalibratedFrame.measure(seen[-1].camera, seen[-1].t_ns, moved, arena.cameras[seen[-1].camera])
     last = FrameSet(sets[-1].t_ns, tuple(seen))
