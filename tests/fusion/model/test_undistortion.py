@@ -131,6 +131,6 @@ def test_the_largest_image_has_a_small_table():
 
 
 def test_no_detection_is_more_certain_than_the_table():
-    """A camera that claims 1e-8 px made the equations of a robot singular: a replay ended with an exception."""
+    """Whatever a camera claims: weights of 1e16 make the equations of a robot singular."""
     columns = measure(LENSES["usual"], Roundels.from_points(np.array([[300.0, 200.0]]), 1e-8))
     assert np.linalg.eigvalsh(columns[COV, 0].reshape(2, 2)).min() >= TOLERANCE_PX**2
