@@ -9,7 +9,7 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, MarkerTable
 from fusion.model.robots import Robot
-from fusion.model.states import MAX_COAST_S, POSITION, THETA, States, predict
+from fusion.model.states import MAX_COAST_S, POSITION, THETA, VELOCITY, States, predict
 from fusion.protocol.pose_messages import TrackingState
 from fusion.protocol.zone_messages import ZoneStates
 from fusion.tracking.gating import POSITION_GATE, START_S, START_SIGMAS
@@ -19,6 +19,7 @@ ASSOCIATED_RAD = 0.15  # rotation sigma above which a constellation is: its mark
 # The same above which one camera alone does not locate it: its equations are not linear that far. At 0.84 rad, two
 # detections displaced a robot by 0.56 m, with a claim of 17 mm.
 UNKNOWN_RAD = 0.5
+SIMULTANEOUS_M = 0.005  # motion between frames, one sigma, that a residual shows: 1 px at 4 m
 START_M = 0.1  # standard deviation of `start_m`
 LOCAL_M = 0.3  # position sigma above which a history does not say where a robot is
 
@@ -123,18 +124,25 @@ class TrackTable:
         rotated = (rotation2 > ASSOCIATED_RAD**2) & ~self.single
         return self.alive & ((position2 < ASSOCIATED_M**2) & ~rotated | self._seen)
 
-    def needed_detections(self, predicted: States) -> Index:
-        """(N,) how many detections, by two cameras, each robot needs because its prediction does not check them: as
-        many as determine its pose and velocity, since frames of different times show any roundels to fit fewer. 0 where
-        the prediction does, or a code.
+    def needed_detections(self, predicted: States, spread_s: float) -> Index:
+        """(N,) how many detections, by two cameras, each robot needs because its prediction does not check them. 0
+        where the prediction does, or a code.
 
         It does not where the rotation does not tell markers apart, or the robot may have moved so far since the last
-        frame set that the detections near it are those of others.
+        frame set that the detections near it are those of others. Fewer equations than determine a pose, and in frames
+        that are `spread_s` apart also an unknown velocity, fit any roundels.
         """
-        rotation2 = np.einsum("nii->n", predicted.P[:, THETA, THETA]) / 3
-        moved2 = np.einsum("nii->n", (predicted.P - self.states.P)[:, POSITION, POSITION]) / 3
+        rotation2, velocity2, moved2 = (
+            np.einsum("nii->n", P[:, part, part]) / 3
+            for P, part in (
+                (predicted.P, THETA),
+                (predicted.P, VELOCITY),
+                (predicted.P - self.states.P, POSITION),
+            )
+        )
         vague = (rotation2 > UNKNOWN_RAD**2) & ~self.single | (moved2 > ASSOCIATED_M**2)
-        return np.where(vague & ~self.coded, np.where(self.single, 3, 6), 0)
+        of_body = np.where(velocity2 * spread_s**2 > SIMULTANEOUS_M**2, 6, 4)
+        return np.where(vague & ~self.coded, np.where(self.single, 2, of_body), 0)
 
     def history_chi2(self, k: int, p: Array, covariance: Array) -> float:
         """Squared Mahalanobis distance of p from robot k's last position, or from its start if never acquired."""

@@ -168,7 +168,8 @@ class Tracker:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
         detections, all_assigned, labelings = associated.association.collect(self._used(frame_set))
-        needed = self.table.needed_detections(associated.prediction.states)
+        spread_s = float(np.ptp(detections.exposures.tau)) if len(detections.exposures.tau) else 0.0
+        needed = self.table.needed_detections(associated.prediction.states, spread_s)
         scene = self.estimator, self.table.markers, associated.prediction, needed, detections
         all_assigned = choose_labelings(*scene, all_assigned, labelings)
         assignments = self._update_states(associated, needed, detections, all_assigned)

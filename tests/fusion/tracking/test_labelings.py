@@ -95,7 +95,7 @@ def test_of_an_unknown_rotation_one_camera_alone_says_nothing(cameras: int, off_
     assert len(seen) == cameras
     predicted = tracker.predict(sets[-1].t_ns)
     assert predicted.tracked.all()
-    assert tracker.table.needed_detections(predicted.prediction.states) == [6]
+    assert tracker.table.needed_detections(predicted.prediction.states, PERIOD_NS * 1e-9) == [6]
     moved = replace(seen[-1].roundels, uv=seen[-1].roundels.uv + off_px)
     seen[-1] = CalibratedFrame.measure(seen[-1].camera, seen[-1].t_ns, moved, arena.cameras[seen[-1].camera])
     last = FrameSet(sets[-1].t_ns, tuple(seen))
