@@ -130,3 +130,16 @@ def test_an_acquisition_counts_the_motion_that_it_infers(speed_m_s: float, is_pr
     fits = refine(tracker.estimator, tracker.table, start, detections)
     assert fits.misfit[0] < 1.0
     assert (fits.motion[0] < MOTION_GATE) == is_probable
+
+
+@pytest.mark.parametrize("markers", [1, 3])
+def test_synchronous_cameras_of_ten_frames_a_second_keep_their_robots(markers: int):
+    """Two of them; a tenth of the detections is missing. After an acquisition, in 0.1 s, robots may move by 0.15 m (one
+    sigma): no more detections are asked for than two such cameras can show."""
+    load = Load(robots=1, markers=markers, cameras=2, hz=10.0, speed_m_s=0.5, false=0.0, synchronised=True)
+    tracker, frames = Tracker(load.rig, load.bodies), load.frames(12.0)
+    states = []
+    while len(used := tuple(islice(frames, load.cameras))) == load.cameras:
+        fused = tracker.track(FrameSet(used[0].t_ns, used))
+        states += [pose.state for pose in fused.poses if used[0].t_ns > START_NS + 2_000_000_000]
+    assert states.count("tracked") > 0.6 * len(states) > 50
