@@ -504,6 +504,12 @@ def mean_by_body(values: NDArray, body: Index, n_bodies: int) -> Array:
 
 def count_checked(robot: Index, camera: Index, n_robots: int) -> Index:
     """(R,) how many of the detections (N,) of robots by cameras each robot has; 0 where one camera alone sees it."""
+    by_two = views(robot, camera, n_robots).sum(1) > 1
+    return np.where(by_two, np.bincount(robot, minlength=n_robots), 0)
+
+
+def views(robot: Index, camera: Index, n_robots: int) -> Mask:
+    """(R, C) whether there are detections (N,) of each robot by each camera."""
     seen = np.zeros((n_robots, np.max(camera, initial=0) + 1), bool)
     seen[robot, camera] = True
-    return np.where(seen.sum(1) > 1, np.bincount(robot, minlength=n_robots), 0)
+    return seen

@@ -26,6 +26,7 @@ from fusion.model.observations import (
     MarkerTable,
     MatchedObservations,
     mean_by_body,
+    views,
 )
 from fusion.model.states import POSITION, States
 from fusion.model.undistortion import COV
@@ -110,20 +111,19 @@ class RobustUpdate:
         self, prediction: Prediction, needed: Index, detections: DetectionTable, assignments: Assignments
     ) -> RobustFit:
         """The updated states, and the assignments that fit; `needed` as of `RobustFit`."""
-        scene = prediction, needed, detections
-        fitted = self._fit(*scene, assignments)
+        fitted = self._fit(prediction, needed, detections, assignments)
         if self.added_px2:
             self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
-        if (again := self._left_out_again(fitted, assignments)) is not None:
+        if (again := self._left_out_again(fitted)) is not None:
             fitted = again
         elif not self._is_unusual(fitted):
             self._left_out = None
             if self.added_px2:
-                fitted = self._fit(*scene, assignments, self.added_px2)
+                fitted = self._again(fitted, fitted.given, self.added_px2)
             else:
                 self._residuals.learn(fitted.assignments.squared_px, fitted.cost, fitted.count)
         else:
-            fitted = self._leave_one_out(fitted, assignments) or self._with_noise(fitted, assignments)
+            fitted = self._leave_one_out(fitted) or self._with_noise(fitted)
         return self._without_incompatible(self._without_wrong_views(fitted))
 
     @staticmethod
@@ -178,34 +178,36 @@ class RobustUpdate:
             added_px2=added_px2,
         )
 
-    def _without(self, k: int, fitted: RobustFit, assignments: Assignments) -> RobustFit:
-        camera = fitted.detections.camera[assignments.detection]
-        scene = fitted.prediction, fitted.needed, fitted.detections
-        return self._fit(*scene, assignments.select(camera != k))
+    def _again(self, fitted: RobustFit, given: Assignments, added_px2: float = 0.0) -> RobustFit:
+        """The fit of other assignments, or with another noise."""
+        return self._fit(fitted.prediction, fitted.needed, fitted.detections, given, added_px2)
 
-    def _left_out_again(self, fitted: RobustFit, assignments: Assignments) -> RobustFit | None:
+    def _without(self, k: int, fitted: RobustFit) -> RobustFit:
+        camera = fitted.detections.camera[fitted.given.detection]
+        return self._again(fitted, fitted.given.select(camera != k))
+
+    def _left_out_again(self, fitted: RobustFit) -> RobustFit | None:
         """The fit without the camera that was left out before, while that one does not agree with it."""
         if self._left_out is None:
             return None
-        again = self._without(self._left_out, fitted, assignments)
+        again = self._without(self._left_out, fitted)
         cost, count = float((fitted.cost - again.cost).sum()), int((fitted.count - again.count).sum())
         return None if self._is_unusual(again) or self._residuals.is_explained(cost, count) else again
 
-    def _leave_one_out(self, fitted: RobustFit, assignments: Assignments) -> RobustFit | None:
+    def _leave_one_out(self, fitted: RobustFit) -> RobustFit | None:
         """The fit without the camera that contradicts predictions and all others, if there is one."""
-        camera = fitted.detections.camera[assignments.detection]
-        fits = {k: self._without(k, fitted, assignments) for k in np.unique(camera).tolist()}
+        camera = fitted.detections.camera[fitted.given.detection]
+        fits = {k: self._without(k, fitted) for k in np.unique(camera).tolist()}
         costs = {k: float(fit.cost.sum()) for k, fit in fits.items()}
         self._left_out = camera_at_fault(float(fitted.cost.sum()), costs)
         return (
             None if self._left_out is None or self._is_unusual(fits[self._left_out]) else fits[self._left_out]
         )
 
-    def _with_noise(self, fitted: RobustFit, assignments: Assignments) -> RobustFit:
+    def _with_noise(self, fitted: RobustFit) -> RobustFit:
         """The fit with as much noise as makes it usual, no less than the frame set before had."""
         self.added_px2 = max(self.added_px2, self._least_px2(fitted))
-        scene = fitted.prediction, fitted.needed, fitted.detections
-        while self._is_unusual(again := self._fit(*scene, assignments, self.added_px2)):
+        while self._is_unusual(again := self._again(fitted, fitted.given, self.added_px2)):
             self.added_px2 *= 2
             if self.added_px2 > MAX_ADDED_PX2:
                 break
@@ -217,13 +219,12 @@ class RobustUpdate:
         doubtful = np.flatnonzero(fitted.contradicting >= A_VIEW)
         if not len(doubtful) or np.median(fitted.contradicting[fitted.count > 0]) > 0:
             return fitted
-        scene, given = (fitted.prediction, fitted.needed, fitted.detections), fitted.given
+        given = fitted.given
         robot, camera = self._markers.robot[given.marker], fitted.detections.camera[given.detection]
-        seen = np.zeros((len(fitted.contradicting), np.max(camera) + 1), bool)
-        seen[robot, camera] = True
+        seen = views(robot, camera, len(fitted.contradicting))
         is_doubtful, wrong = np.isin(robot, doubtful), np.zeros_like(seen)
         costs = {
-            k: self._fit(*scene, given.select(is_doubtful & (camera != k)), fitted.added_px2).cost
+            k: self._again(fitted, given.select(is_doubtful & (camera != k)), fitted.added_px2).cost
             for k in np.flatnonzero(seen[doubtful].any(0)).tolist()
         }
         for row in doubtful.tolist():
@@ -231,11 +232,9 @@ class RobustUpdate:
             k = camera_at_fault(float(fitted.cost[row]), without)
             if k is not None:
                 wrong[row, k] = True
-        return (
-            self._fit(*scene, given.select(~wrong[robot, camera]), fitted.added_px2)
-            if wrong.any()
-            else fitted
-        )
+        if not wrong.any():
+            return fitted
+        return self._again(fitted, given.select(~wrong[robot, camera]), fitted.added_px2)
 
     def _without_incompatible(self, fitted: RobustFit) -> RobustFit:
         """The fit to detections that do not contradict the others of their robots; all keep their residuals.

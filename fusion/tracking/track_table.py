@@ -141,6 +141,7 @@ class TrackTable:
             )
         )
         vague = (rotation2 > UNKNOWN_RAD**2) & ~self.single | (moved2 > ASSOCIATED_M**2)
+        # Of two equations each; the velocity has a prior, so that as many as unknowns suffice with it.
         of_body = np.where(velocity2 * spread_s**2 > SIMULTANEOUS_M**2, 6, 4)
         return np.where(vague & ~self.coded, np.where(self.single, 2, of_body), 0)
 

@@ -15,7 +15,6 @@ from scipy.stats import chi2
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame
-from fusion.model.observations import MarkerTable
 from fusion.model.states import POSITION, Snapshot
 from fusion.rig_graph.hypotheses import CAUSES, RIVAL, Verdict
 from fusion.rig_graph.keyframes import Keyframes
@@ -274,16 +273,14 @@ def test_clocks_that_explain_keyframes_alike_are_in_doubt_together(n_cameras: in
     """The stamps of cam1 jump by 10 ms: two cameras show only the difference of their clocks."""
     arena = Arena(ROBOTS, MOTIONS, cameras=dict(list(ring().items())[:n_cameras]), sigma_px=0.1)
     tracker, synchronizer = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS)
-    markers = MarkerTable.of(list(ROBOTS.values()))
-    keyframes = Keyframes(tracker.cameras, markers, min(WINDOWS))
+    robots, keyframes = tracker.table, Keyframes(tracker.cameras, tracker.table.markers, min(WINDOWS))
     for frame in arena.frames(90):
         jumped = frame.camera == "cam1" and arena.seconds(frame.t_ns) > 1.0
         synchronizer.add(replace(frame, t_ns=frame.t_ns + 10_000_000 * jumped))
         for frame_set in synchronizer.take(frame.t_ns):
             tracker.track(frame_set)
-            robots = tracker.table
             keyframes.add(frame_set, Snapshot(frame_set.t_ns, robots.states, robots.located))
-    other = watch(tuple(keyframes.kept), tracker.cameras, markers)
+    other = watch(tuple(keyframes.kept), tracker.cameras, robots.markers)
     assert other.gain > chi2.isf(RIVAL, 1)
     assert set(other.offsets_s) == doubted
     assert other.offsets_s[1] == pytest.approx(0.01, rel=0.2)

@@ -39,9 +39,9 @@ def test_slow_cameras_exchange_no_markers(tmp_path: Path, seed: int):
 
 
 @pytest.mark.ci
-def test_cameras_of_seven_frames_a_second_exchange_no_robots(tmp_path: Path):
-    """In 0.14 s robots move by 0.17 m (one sigma). Before, one took the detections of another and was 3.2 m off, and
-    one followed a view with exchanged markers, against all others."""
+def test_cameras_of_seven_frames_a_second_exchange_no_markers(tmp_path: Path):
+    """In 0.14 s robots move by 0.17 m (one sigma). Before, one followed a view with exchanged markers, against all
+    others, and was 45 mm off with a claim of 9 mm."""
     load = Load(robots=10, cameras=4, hz=7.0, speed_m_s=0.5)
     with VirtualArena(tmp_path, load, 3) as arena:
         arena.wait(4.0)
@@ -100,7 +100,7 @@ def test_of_an_unknown_rotation_one_camera_alone_says_nothing(cameras: int, off_
     seen[-1] = CalibratedFrame.measure(seen[-1].camera, seen[-1].t_ns, moved, arena.cameras[seen[-1].camera])
     last = FrameSet(sets[-1].t_ns, tuple(seen))
     update = tracker.update(tracker.associate(predicted, last), last)
-    assert (update.poses[0].state == "tracked") == is_used
+    assert (len(update.assignments) > 0) == is_used
 
 
 def test_a_robot_is_not_acquired_by_an_improbable_motion(monkeypatch: pytest.MonkeyPatch):
