@@ -30,7 +30,9 @@ class LogLimits:
             has lasted for T has written log(T / pause_s) / log(growth) lines, ...
         growth: of the pause.
         longest_pause_s: ... up to this, ...
-        quiet_s: ... and halves with each such time without the kind. What is held back is written after it as well.
+        quiet_s: ... and halves with each such time without the kind, ...
+        quiet_share: ... or with this share of the pause if that is longer: a camera that comes and goes once a minute
+            for days does not write a line a minute. What is held back is written after a quiet time as well.
         lines: of all kinds at once; those of a traceback count ...
         line_s: ... then one in this time. A line that stands for others, as a digest of all kinds that were held back
             does, costs as many lines as it stands for, ...
@@ -43,6 +45,7 @@ class LogLimits:
     growth: float = 4.0
     longest_pause_s: float = 3600.0
     quiet_s: float = 60.0
+    quiet_share: float = 0.25
     lines: int = 32
     line_s: float = 1.0
     most_lines: int = 10
@@ -64,17 +67,22 @@ class _Pause:
     @property
     def quiet_from_s(self) -> float:
         """When a quiet time will have passed."""
-        return self._last_s + self._limits.quiet_s
+        return self._last_s + self._quiet_s(self._pause_s)
 
     def at(self, now_s: float) -> float:
-        """What is left of the pause, s."""
-        return (
-            self._pause_s * 0.5 ** ((now_s - self._last_s) // self._limits.quiet_s) if self._pause_s else 0.0
-        )
+        """What is left of the pause, s; 0 once nothing is left but the first one."""
+        pause_s, quiet_from_s = self._pause_s, self.quiet_from_s
+        while pause_s and now_s >= quiet_from_s:
+            pause_s = pause_s / 2 if pause_s > self._limits.pause_s else 0.0
+            quiet_from_s += self._quiet_s(pause_s)
+        return pause_s
 
     def recurs(self, now_s: float) -> bool:
         """Whether a line was written of late: not more than one quiet time ago for each line."""
         return self.at(now_s) > self._limits.pause_s / 2
+
+    def _quiet_s(self, pause_s: float) -> float:
+        return max(self._limits.quiet_s, self._limits.quiet_share * pause_s)
 
     def is_quiet(self, now_s: float) -> bool:
         """Whether nothing happened for a quiet time."""

@@ -44,6 +44,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
 PICTURE_S = 1.0  # between two pictures of a public recording
 # For the answer of a busy server, also after the end of a recording: without the robots there is no replay.
 ANSWER_S = 10.0
+CHANGE_S = 1.0  # for the answer after a change, at the end of a recording that has robots
 NO_ROBOTS = "no robot is declared: a replay of this recording needs --robots robots.yaml"
 DETECTIONS, POSE, FRAMES = "/detections", "/pose", "/fusion/frames"  # the ends of keys
 KINDS = {DETECTIONS: Detections, POSE: RobotPose, FRAMES: FusedFrames}
@@ -153,7 +154,8 @@ class ArenaRecorder:
     def run(self, stop: threading.Event, seconds: float | None = None) -> None:
         """Write until `stop` is set, or for `seconds`; then write what was received before.
 
-        A short recording ends up to `ANSWER_S` later, with the robots that the server did not send yet.
+        A recording without robots ends up to `ANSWER_S` later, with those that the server did not send yet. Others wait
+        for a change of the robots only briefly: any client can publish a status that names robots of its own.
 
         Raises:
             ConfigError: the disk is full; the file is closed.
@@ -170,7 +172,7 @@ class ArenaRecorder:
         finally:
             self._unsubscribe()
         self._write_queued()
-        end_s = time.monotonic() + ANSWER_S
+        end_s = time.monotonic() + (ANSWER_S if self.robots is None else CHANGE_S)
         while self._writer.counts and robots_key(self._arena) in self._missing and time.monotonic() < end_s:
             self._request_missing()
             self._write_next(WAIT_S)

@@ -154,16 +154,28 @@ def test_a_flood_of_one_kind_writes_as_many_lines_as_the_logarithm_of_its_durati
 @given(st.lists(st.sampled_from([0.0, 0.01, 0.3, 2.0, 7.0, 30.0, 59.0, 61.0, 130.0]), max_size=300))
 @settings(max_examples=50)
 def test_no_pattern_of_one_kind_writes_more_than_a_flood_and_a_line_a_minute(gaps_s: list[float]):
-    """Each quiet minute halves the pause, and so permits one more line. None is held back for longer than a minute."""
+    """Each quiet time halves the pause, and so permits one more line. None is held back for longer than that."""
     log, limits = VirtualLog(), LogLimits()
     times = np.cumsum(gaps_s).tolist()
     for at_s in times:
         log.log(at_s)
     seconds = times[-1] if times else 0.0
-    log.advance(seconds + limits.quiet_s)
+    longest_pause_s = max(limits.pause_s, limits.growth * seconds)  # each is four times as long as one before it
+    log.advance(seconds + max(limits.quiet_s, limits.quiet_share * longest_pause_s))
     written = log.close()
     assert sum(held for _, held, _ in written) == len(times)
     assert len(written) <= 3 + math.log2(1 + seconds / limits.pause_s) + seconds / limits.quiet_s
+
+
+def test_a_state_that_changes_once_a_minute_writes_few_lines():
+    """As a camera that comes and goes: 27 lines an hour on average before, with a quiet time of a minute."""
+    log = VirtualLog()
+    times_s = np.cumsum(np.random.default_rng(1).exponential(60.0, 60))
+    for at_s in times_s:
+        log.log(at_s)
+    log.advance(times_s[-1] + LogLimits().quiet_share * LogLimits().longest_pause_s)
+    assert sum(held for _, held, _ in log.lines) == len(times_s)
+    assert len(log.lines) <= 16
 
 
 def test_a_kind_that_was_quiet_for_long_is_written_at_once_again():

@@ -22,6 +22,7 @@ from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.commands.trim import trim
 from fusion.protocol.pose_messages import Robots
+from fusion.recordings import arena_recording
 from fusion.recordings.arena_recording import DETECTIONS, NO_ROBOTS, POSE, ArenaRecorder, read_recording
 from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
 from fusion.tracking.result import TrackingResult
@@ -88,6 +89,29 @@ def test_robots_that_are_declared_after_the_start_are_recorded(tmp_path, caplog:
         thread.join(DEADLINE_S)
     assert read_recording(path).robots == {"late": TRIANGLE}
     assert replay(path, out=tmp_path / "fused.mcap") == 0
+
+
+def test_a_forged_status_does_not_keep_the_recorder_from_ending(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    """It names robots that no server declares, and the server does not answer; ten seconds before."""
+    monkeypatch.setattr(arena_recording, "ANSWER_S", 100 * DEADLINE_S)
+    stop, busy, release, path = threading.Event(), threading.Event(), threading.Event(), tmp_path / "x.mcap"
+    with serving(config(tmp_path)) as (server, client), RecordingWriter(path) as writer:
+        recorder = ArenaRecorder(client.connection, "test", writer)
+        thread = threading.Thread(target=recorder.run, args=(stop,), daemon=True)
+        thread.start()
+        wait_for(lambda: recorder.robots == ARENA.robots.keys())
+        status = client.status(DEADLINE_S).next()
+        server.transport.enqueue(lambda: busy.set() or release.wait(2 * DEADLINE_S))
+        assert busy.wait(DEADLINE_S)
+        before = writer.counts[KEYS.fusion_status]
+        forged = msgspec.structs.replace(status, robots={"forged": "tracked"})
+        client.session.put(KEYS.fusion_status, encode(forged))
+        wait_for(lambda: writer.counts[KEYS.fusion_status] > before)
+        stop.set()
+        thread.join(DEADLINE_S)
+        has_ended = not thread.is_alive()
+        release.set()
+    assert has_ended
 
 
 @pytest.mark.parametrize("is_link", [False, True])
