@@ -288,6 +288,10 @@ class DetectionTable(Columns):
         columns[rows] = values.reshape(columns[rows].shape)
         return replace(self, columns=columns)
 
+    def with_noise(self, added_px2: float) -> "DetectionTable":
+        """The same with a variance added to both coordinates of all centres, px^2."""
+        return self.replaced(COV, self.cov + added_px2 * np.eye(2)[:, :, None]) if added_px2 else self
+
     def may_be(self, rows: Index, codes: Index) -> Mask:
         """(K,) whether detections (rows) may be markers with these codes: all that have no name, or that one.
 

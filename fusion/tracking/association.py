@@ -17,10 +17,10 @@ prediction P, and the density of all roundels in the image:
 
 A robot of which much is missing needs more than what its missing markers cost: log(1 - P_D) each, and at most the
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
-probability that it does now. In clutter, where other roundels are expected in gates, the nearest detection may be
-another's: there a camera's view of a robot is judged given what the other cameras see. A camera that alone shows most
-of what it usually sees elsewhere, all by one turn, was moved: what it still shows near the predictions is not
-theirs.
+probability that it does now. Where a camera shows the smaller part of what it usually shows of a robot, and in clutter,
+where other roundels are expected in gates, the nearest detection may be another's: there its view of the robot is
+judged given what the other cameras see. A camera that alone shows most of what it usually sees elsewhere, all by one
+turn, was moved: what it still shows near the predictions is not theirs.
 """
 
 from collections.abc import Sequence
@@ -209,12 +209,13 @@ CLUTTERED = np.exp(CHANGED)  # other roundels expected in a gate: as probable th
 @dataclass(frozen=True, slots=True, eq=False)
 class _Doubts:
     """Robots of which much is missing (R,), what that costs (R,), and views (R, C) with the logarithm of how probable
-    they are before they are seen."""
+    they are before they are seen, and the variance of their detections beside their own noise, px^2."""
 
     fallen: Mask
     cost: Array
     views: Mask
     prior: float
+    noise_px2: float = 0.0
 
 
 class OwnDetections:
@@ -238,8 +239,14 @@ class OwnDetections:
         self._elsewhere = np.zeros(len(cameras.names), np.intp)  # frame sets in a row, of each camera
         self.displaced = dict[int, int]()
 
-    def are_own(self, given: AssignedFrames) -> Mask:
-        """(N,) assignments of a frame set that are more probable than detections of something else."""
+    def are_own(self, given: AssignedFrames, noise_px2: float) -> Mask:
+        """(N,) assignments of a frame set that are more probable than detections of something else.
+
+        Args:
+            given: the frame set.
+            noise_px2: variance that detections usually have beside their own noise: of a view that shows little of a
+                robot, the rest may be outside the gates by errors of the camera.
+        """
         robot = self._markers.robot[given.assignments.marker]
         frame = given.detections.frame[given.assignments.detection]
         view = robot * self._shape[1] + given.detections.exposures.camera[frame]
@@ -255,11 +262,16 @@ class OwnDetections:
         fallen = (count.sum(1) > 0) & (missing.sum(1) > count.sum(1))
         unseen = self._unseen & (count > 0) & ~fallen[:, None]
         cluttered = self._cluttered(given) & (count > 0) & ~fallen[:, None] & ~unseen
-        own = ~(fallen[robot] | (unseen | cluttered).ravel()[view] | displaced[view % self._shape[1]])
+        partial = (missing > count) & (count > 0) & ~fallen[:, None] & ~unseen & ~cluttered
+        own = ~(
+            fallen[robot] | (unseen | cluttered | partial).ravel()[view] | displaced[view % self._shape[1]]
+        )
         # What a camera did not see before is judged given all that others see.
+        no_robots = np.zeros_like(fallen)
         for doubts in (
             _Doubts(fallen, cost, cluttered, 0.0),
-            _Doubts(np.zeros_like(fallen), cost, unseen, CHANGED),
+            _Doubts(no_robots, cost, partial, 0.0, noise_px2),
+            _Doubts(no_robots, cost, unseen, CHANGED),
         ):
             if doubts.fallen.any() or doubts.views.any():
                 own[self._accepted(given, view, own, doubts)] = True
@@ -301,7 +313,8 @@ class OwnDetections:
         n_cameras = self._shape[1]
         rows = np.flatnonzero((doubts.fallen | doubts.views.any(1))[view // n_cameras])
         robot, camera = np.divmod(view[rows], n_cameras)
-        observations = MatchedObservations.of(given.assignments.select(rows), given.detections, self._markers)
+        noisy = given.detections.with_noise(doubts.noise_px2)
+        observations = MatchedObservations.of(given.assignments.select(rows), noisy, self._markers)
         A, nu = self._estimator.innovations(given.states, observations)
         cov, frame = observations.detections.cov, observations.detections.frame
         # The density of other roundels, of pixels instead of whitened centres.

@@ -29,7 +29,6 @@ from fusion.model.observations import (
     views,
 )
 from fusion.model.states import POSITION, States
-from fusion.model.undistortion import COV
 from fusion.monitoring.residual_monitor import LEARNED, ResidualMonitor, camera_at_fault
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
@@ -99,6 +98,11 @@ class RobustUpdate:
         self._residuals = old._residuals
 
     @property
+    def noise_px2(self) -> float:
+        """Variance that detections have beside their own noise, by usual errors of the cameras and unexplained ones."""
+        return self._residuals.slack_px**2 + self.added_px2
+
+    @property
     def is_doubtful(self) -> bool:
         """Whether the last frame set contradicted the predictions."""
         return self._left_out is not None or self.added_px2 > 0
@@ -144,9 +148,7 @@ class RobustUpdate:
     ) -> RobustFit:
         """The updated states; a robot that its detections contradict stays as predicted and loses them, as does one
         whose prediction does not check them, if they contradict each other or are too few."""
-        noisy = detections
-        if added_px2:
-            noisy = detections.replaced(COV, detections.cov + added_px2 * np.eye(2)[:, :, None])
+        noisy = detections.with_noise(added_px2)
         observations = MatchedObservations.of(assignments, noisy, self._markers)
         observations = self._estimator.prepared(prediction.states, observations)
         fitted = self._estimator.fit(prediction, observations)

@@ -269,7 +269,7 @@ class Tracker:
         """Update the states of the robots; returns the assignments that fit, with residuals."""
         prediction, tracked = associated.prediction, associated.tracked
         given = AssignedFrames(prediction.states, tracked, detections, assignments)
-        own = assignments.select(self.own.are_own(given))
+        own = assignments.select(self.own.are_own(given, self.robust.noise_px2))
         fitted = self.robust.update(prediction, needed, detections, own)
         self.table.states = fitted.states
         self.rig_response.update(fitted)
