@@ -7,6 +7,7 @@ times of arrival.
 """
 
 import heapq
+import logging
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -30,10 +31,11 @@ from fusion.recordings.arena_recording import DETECTIONS, FRAMES, ArenaRecording
 from fusion.rig_graph.rig_monitor import RecordedJudgements
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Refusal, admit
-from fusion.tracking.result import TOO_MANY_UNASSIGNED, TrackingResult
+from fusion.tracking.result import NO_SOLUTION, TOO_MANY_UNASSIGNED, TrackingResult
 from fusion.tracking.smoothing import Smoother
 from fusion.tracking.tracker import Tracker
 
+log = logging.getLogger("fusion.replay")
 Held = dict[tuple[str, int], Detections]  # by camera and stamp
 HELD_NS = 10_000_000_000
 STATES = ("tracked", "coasting", "lost")
@@ -135,8 +137,8 @@ def fuse_recording(
         FusionError: no frame could be used.
     """
     summary = Summary() if summary is None else summary
-    tracker = Tracker(arena.cameras, arena.robots, arena.limits)
-    yield from _fuse(_synchronize(messages, tracker, arena, summary.faults), tracker, arena, summary)
+    tracking = _Tracking(arena, summary.faults)
+    yield from _fuse(_synchronize(messages, tracking, arena, summary.faults), tracking, arena, summary)
 
 
 def fuse_again(
@@ -153,17 +155,44 @@ def fuse_frame_sets(
     frame_sets: Iterable[FrameSet], arena: OfflineArena, summary: Summary | None = None
 ) -> Iterator[TrackingResult]:
     """Fuse frame sets, as those that the server formed; see `fuse_recording`."""
-    tracker = Tracker(arena.cameras, arena.robots, arena.limits)
-    yield from _fuse(frame_sets, tracker, arena, Summary() if summary is None else summary)
+    summary = Summary() if summary is None else summary
+    yield from _fuse(frame_sets, _Tracking(arena, summary.faults), arena, summary)
+
+
+class _Tracking:
+    """A tracker that acquires all robots again after a frame set without a solution, as the live server's does.
+
+    Attributes:
+        tracker: the present one.
+    """
+
+    def __init__(self, arena: OfflineArena, faults: Counter[str]) -> None:
+        self.tracker = Tracker(arena.cameras, arena.robots, arena.limits)
+        self._faults = faults
+
+    def track(self, frame_set: FrameSet) -> TrackingResult | None:
+        """The robots after a frame set; None if it has no solution, which is counted."""
+        try:
+            return self.tracker.track(frame_set)
+        except Exception:  # NumPy's and GTSAM's of a singular system, or a bug that some input shows
+            self._faults[NO_SOLUTION] += 1
+            log.exception(
+                "the frame set at t_ns %d has no solution; robots are acquired again", frame_set.t_ns
+            )
+            self.tracker = self.tracker.restarted()
+            return None
 
 
 def _fuse(
-    frame_sets: Iterable[FrameSet], tracker: Tracker, arena: OfflineArena, summary: Summary
+    frame_sets: Iterable[FrameSet], tracking: _Tracking, arena: OfflineArena, summary: Summary
 ) -> Iterator[TrackingResult]:
-    smoother = Smoother(tracker.table.names) if arena.smooth else None
+    smoother = Smoother(tracking.tracker.table.names) if arena.smooth else None
     judgements = RecordedJudgements()
     for frame_set in frame_sets:
-        fused = tracker.track(frame_set)
+        fused = tracking.track(frame_set)
+        if fused is None:
+            continue
+        tracker = tracking.tracker
         summary.add(fused)
         if smoother is None:
             yield fused
@@ -174,7 +203,7 @@ def _fuse(
             judgements.allow(frame_set.judged)
         for correction in tracker.check_extrinsics(frame_set):
             summary.add_correction(correction, frame_set.t_ns)
-    summary.not_acquired = tracker.not_acquired()
+    summary.not_acquired = tracking.tracker.not_acquired()
     if not summary.frame_sets:
         placed = ", ".join(sorted(arena.cameras))
         raise FusionError(
@@ -204,7 +233,7 @@ def read_detections(
 
 def _synchronize(
     messages: Iterable[tuple[int, Detections]],
-    tracker: Tracker,
+    tracking: _Tracking,
     arena: OfflineArena,
     faults: Counter[str],
 ) -> Iterator[FrameSet]:
@@ -214,7 +243,7 @@ def _synchronize(
         if not isinstance(admitted, CalibratedFrame):
             faults[f"frames of camera '{name}', {REFUSED[admitted]}"] += 1
             continue
-        frame = tracker.admit(admitted)
+        frame = tracking.tracker.admit(admitted)
         if frame is not None:
             synchronizer.add(frame)
         else:

@@ -319,6 +319,7 @@ class Verdict:
         misfit: mean squared residual without a fault in units of its expectation, not below 1.
         scale: of the errors that the calibration states, if no single camera is at fault: the most likely one.
         size: logarithm of how much larger the arena may be than the rig.
+        is_pose_known: False if another camera may be at fault as well, so that the fit shows no pose of this one.
     """
 
     cause: Cause | None
@@ -327,6 +328,7 @@ class Verdict:
     misfit: float = 1.0
     scale: float = 1.0
     size: float = 0.0
+    is_pose_known: bool = True
 
     @property
     def is_of_size(self) -> bool:
@@ -472,8 +474,8 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
     Only cameras that see robots count: of three, one that turned looks like the two others that turned together.
 
     A hypothesis that frees more than the best one is no rival: it contains that one, and its penalty says that it
-    explains no more. One camera at fault is more probable than larger errors of all, by `RIVAL`;
-    only cameras that can be found at fault refute these.
+    explains no more. Where all explanations have a camera in common, that one moved, whichever is true. One camera at
+    fault is more probable than larger errors of all, by `RIVAL`; only cameras that can be found at fault refute these.
     """
     variance = min(f.variance for f in fits)
     score = {id(f): f.cost / variance + f.penalty + f.hypothesis.odds for f in fits}
@@ -493,6 +495,9 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
     is_of_few = cause == "focal" or 2 * len(cameras) < len(seeing)
     if not rivals and (is_of_few or cameras == tuple(moved)):
         return Verdict(cause, cameras, best, size=size)
+    shared = set.intersection(*({*f.hypothesis.cameras} for f in explanations))
+    if all(f.hypothesis.cause == "pose" for f in explanations) and len(shared) == 1 and len(seeing) > 2:
+        return Verdict("pose", tuple(shared), best, is_pose_known=False)
     named = {k for f in explanations for k in f.hypothesis.cameras}
     return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best, size=size)
 

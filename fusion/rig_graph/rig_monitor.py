@@ -376,7 +376,7 @@ class RigMonitor:
         name, k = names[0], verdict.cameras[0]
         changes = () if name in self.excluded else (ExtrinsicsCorrection(name, None),)
         self.excluded.add(name)
-        placed = self._place(window, verdict.fit, k) if recalibrates else None
+        placed = self._place(window, verdict.fit, k) if recalibrates and verdict.is_pose_known else None
         if placed is None:
             return changes
         self._use(name)

@@ -74,12 +74,12 @@ class TrackingPipeline:
         return self.active_robots.robots
 
     def restart(self) -> None:
-        """Drop all frames and tracks; the tracker acquires all robots again, with the clocks as they are known."""
-        old = self.tracker
-        self._start(self.cameras)
-        if old is not None and self.tracker is not None:
-            self.tracker.monitors.clocks.inherit(old.monitors.clocks)
-            self.tracker.monitors.rig.inherit_poses(old.monitors.rig)
+        """Drop all frames and tracks; the tracker acquires all robots again."""
+        if self.tracker is not None:
+            self.tracker = self.tracker.restarted()
+            self.judge_cameras_in(self._judging)
+        self.synchronizer = self._new_synchronizer()
+        self.early = None
 
     def replace_rig(self, rig: Rig, now_ns: int, source: RequestSource | None = None) -> None:
         """Use a rig that was requested, then save it. Robots stay tracked if at most one camera differs.
@@ -183,9 +183,12 @@ class TrackingPipeline:
         self.judge_cameras_in(self._judging)
         self.refine(self._refines)
         self.pause_acquisition(self._is_wand_recorded)
-        self.synchronizer = FrameSynchronizer.at_rate(self._config.rate_hz, limits.lateness_ms)
+        self.synchronizer = self._new_synchronizer()
         if cameras:
             log.info("active calibration: %s", ", ".join(cameras))
+
+    def _new_synchronizer(self) -> FrameSynchronizer:
+        return FrameSynchronizer.at_rate(self._config.rate_hz, self._config.limits.lateness_ms)
 
     def follow_robots(self, message: Robots) -> None:
         """Use the robots that the first zone's server published; raises FusionError if they can't be tracked."""

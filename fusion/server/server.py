@@ -51,7 +51,7 @@ from fusion.server.storage.audit import AuditLog
 from fusion.server.storage.camera_registry import CameraRegistry
 from fusion.server.transport import INTERNAL_ERROR, Transport, open_session
 from fusion.server.zones.zone_exchange import ZoneExchange
-from fusion.tracking.result import TOO_MANY_UNASSIGNED, latency_of
+from fusion.tracking.result import NO_SOLUTION, TOO_MANY_UNASSIGNED, latency_of
 from fusion.tracking.tracker import Tracker
 
 log = logging.getLogger("fusion")
@@ -260,7 +260,7 @@ class Server:
         try:
             self._track_and_publish(self.pipeline.tracker, frame_set)
         except Exception:  # NumPy's and GTSAM's of a singular system, or a bug that some input shows
-            self.statistics.count_fault("frame set without a solution")
+            self.statistics.count_fault(NO_SOLUTION)
             log.exception("a frame set has no solution; all robots are acquired again")
             self.pipeline.restart()
 

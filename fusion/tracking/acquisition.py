@@ -147,7 +147,7 @@ class Acquisition:
         """The constellations that the markers identify, and why the others are not among them."""
         if not len(missing):
             return [], {}
-        self._usual = _usual_misfit(table, detections, assignments) or self._usual
+        self._usual = _usual_misfit(table, self._cameras, detections, assignments) or self._usual
         turn = self._turn
         rows = np.roll(missing, -int(np.searchsorted(missing, turn)))[:MAX_BODIES]
         robots = {row: table.robots[row] for row in rows.tolist()}
@@ -185,16 +185,20 @@ class Acquisition:
         return refine(self._estimator, table, starts, detections)
 
 
-def _usual_misfit(table: TrackTable, detections: DetectionTable, assignments: Assignments) -> float:
+def _usual_misfit(
+    table: TrackTable, cameras: CameraArray, detections: DetectionTable, assignments: Assignments
+) -> float:
     """The median of the mean squared residuals of tracked robots, in standard deviations, no less than the noise of
-    detections explains; 0 without any."""
+    detections explains; 0 without any. What errors of the cameras explain is not usual unless robots show it: while
+    cameras contradict each other, claims contain errors of pixels, and constellations of others would fit."""
     noise = detections.variance_px2[assignments.detection]
+    own = noise - cameras.error_px[detections.camera[assignments.detection]] ** 2
     d2, known = assignments.squared_px / (noise + SLACK_PX**2), np.isfinite(assignments.squared_px)
     if not known.any():
         return 0.0
     robot = table.markers.robot[assignments.marker[known]]
     means = mean_by_body(d2[known], robot, len(table.robots))[np.unique(robot)]
-    return max(float(np.median(means)), float(np.median(2 * noise / (noise + SLACK_PX**2))))
+    return max(float(np.median(means)), float(np.median(2 * own / (noise + SLACK_PX**2))))
 
 
 def _without(markers: list[Marker], assignments: Assignments) -> list[Marker]:

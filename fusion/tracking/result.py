@@ -21,6 +21,7 @@ from fusion.tracking.rays import Marker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers
 
+NO_SOLUTION = "frame set without a solution"
 TOO_MANY_UNASSIGNED = "frame sets with more unassigned roundels than are searched at once"
 MAX_CAMERAS = 64  # bits of the `cameras` column of `Markers`
 

@@ -219,6 +219,16 @@ class Tracker:
         other.table.claim(other.rig_response.claimed(other.table.states.P))
         return other
 
+    def restarted(self) -> "Tracker":
+        """A tracker of the same robots that acquires all of them again, after a frame set without a solution. It knows
+        the clocks of the cameras and the poses to which they may return."""
+        robots = dict(zip(self.table.names, self.table.robots, strict=True))
+        other = Tracker(self.cameras.as_dict(), robots, self.limits, self._recalibrates)
+        other.acquires_none = self.acquires_none
+        other.monitors.clocks.inherit(self.monitors.clocks)
+        other.monitors.rig.inherit_poses(self.monitors.rig)
+        return other
+
     def contradictions(self) -> tuple[Contradiction, ...]:
         """The cameras and the robots that contradict what the rig and robots.yaml state of them; each robot is logged
         when it first appears."""

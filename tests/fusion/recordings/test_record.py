@@ -4,7 +4,7 @@
 import csv
 import threading
 from importlib.metadata import version
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 
 import msgspec
@@ -21,12 +21,14 @@ from camera_node.protocol.server_connection import Connection, ServerConnection
 from fusion.commands.record import record
 from fusion.commands.replay import replay
 from fusion.commands.trim import trim
+from fusion.model.frames import FrameSet
 from fusion.protocol.pose_messages import Robots
 from fusion.recordings import arena_recording
 from fusion.recordings.arena_recording import DETECTIONS, NO_ROBOTS, POSE, ArenaRecorder, read_recording
-from fusion.recordings.offline_fusion import OfflineArena, fuse_recording
-from fusion.tracking.result import TrackingResult
+from fusion.recordings.offline_fusion import OfflineArena, Summary, fuse_recording
+from fusion.tracking.result import NO_SOLUTION, TrackingResult
 from fusion.tracking.smoothing import Smoother
+from fusion.tracking.tracker import Tracker
 from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line, precise
 from tests.fusion.tracks import errors, poses_of
@@ -69,6 +71,23 @@ def test_a_replay_repeats_the_poses(tmp_path):
     replay(tmp_path / "in.mcap", out=tmp_path / "poses.csv")
     with (tmp_path / "poses.csv").open() as file:
         assert [int(row["t_ns"]) for row in csv.DictReader(file)] == [pose.t_ns for pose in expected]
+
+
+def test_a_replay_goes_on_after_a_frame_set_without_a_solution(monkeypatch: pytest.MonkeyPatch):
+    """As the server does; before, it ended with an exception."""
+    track, numbers = Tracker.track, count()
+
+    def without_a_covariance_once(self: Tracker, frame_set: FrameSet) -> TrackingResult:
+        if next(numbers) == 10:
+            self.table.states.P.fill(np.nan)
+        return track(self, frame_set)
+
+    monkeypatch.setattr(Tracker, "track", without_a_covariance_once)
+    messages, summary = sorted(MOVING.messages(30), key=lambda m: m.t_ns), Summary()
+    arena = OfflineArena(MOVING.cameras, MOVING.robots)
+    results = [*fuse_recording([(m.t_ns + 20_000_000, m) for m in messages], arena, summary)]
+    assert summary.faults[NO_SOLUTION] == 1
+    assert [pose.state for pose in results[-1].poses] == ["tracked"]
 
 
 def test_robots_that_are_declared_after_the_start_are_recorded(tmp_path, caplog: pytest.LogCaptureFixture):

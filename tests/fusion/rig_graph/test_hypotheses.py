@@ -220,6 +220,16 @@ def test_more_free_cameras_are_no_rival_of_one_that_explains_as_much():
     assert decide(fits, range(6)).cameras == (4,)
 
 
+def test_a_camera_that_all_explanations_have_is_at_fault():
+    """Whether another one moved with it is open, so its pose is not known. Before, claims of all cameras grew."""
+    pairs = [fitted("pose", (2, 4), 6, 400.0), fitted("pose", (3, 4), 6, 405.0)]
+    fits = [fitted(None, (), 6, 2000.0), fitted("pose", (4,), 6, 900.0), *pairs]
+    verdict = decide(fits, range(6))
+    assert (verdict.cause, verdict.cameras, verdict.is_pose_known) == ("pose", (4,), False)
+    undecided = decide([*fits, fitted("clock", (4,), 6, 475.0)], range(6))
+    assert undecided.cause is None
+
+
 def test_errors_of_a_cause_are_free_and_no_others():
     for cause, columns in CAUSES.items():
         free = Hypothesis.of(cause, (1,), 3).free
