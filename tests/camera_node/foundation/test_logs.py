@@ -160,10 +160,7 @@ def test_no_pattern_of_one_kind_writes_more_than_a_flood_and_a_line_a_minute(gap
     for at_s in times:
         log.log(at_s)
     seconds = times[-1] if times else 0.0
-    longest_pause_s = max(
-        limits.pause_s, limits.growth * seconds
-    )  # each is four times as long as one before it
-    log.advance(seconds + max(limits.quiet_s, limits.quiet_share * longest_pause_s))
+    log.advance(seconds + max(limits.quiet_s, limits.quiet_share * limits.longest_pause_s))
     written = log.close()
     assert sum(held for _, held, _ in written) == len(times)
     assert len(written) <= 3 + math.log2(1 + seconds / limits.pause_s) + seconds / limits.quiet_s
