@@ -2,8 +2,9 @@
 """Defines the messages of a camera: MessagePack maps with arrays as little-endian binary columns, and Zenoh keys."""
 
 import math
+import threading
 from collections.abc import Mapping
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
@@ -467,6 +468,19 @@ def encode(message: msgspec.Struct) -> bytes:
     return msgspec.msgpack.encode(message)
 
 
+_decoders: dict[type, msgspec.msgpack.Decoder[Any]] = {}
+_building = threading.Lock()
+
+
+def _decoder(kind: type[T]) -> "msgspec.msgpack.Decoder[T]":
+    """The decoder of a kind. One thread builds it: two that do so at once for types with a common part read memory that
+    is not written yet, and the process ends (msgspec 0.22, `test_threads_that_decode_a_kind_first_do_not_crash`)."""
+    if kind not in _decoders:
+        with _building:
+            _decoders.setdefault(kind, msgspec.msgpack.Decoder(kind))
+    return _decoders[kind]
+
+
 def decode(data: bytes, kind: type[T]) -> T:
     """Decode and check bytes from the network.
 
@@ -476,7 +490,7 @@ def decode(data: bytes, kind: type[T]) -> T:
     if len(data) > (limit := getattr(kind, "MAX_BYTES", MAX_BYTES)):
         raise MessageError(f"{kind.__name__} of {len(data)} bytes; the limit is {limit}")
     try:
-        message = msgspec.msgpack.decode(data, type=kind)
+        message = _decoder(kind).decode(data)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise MessageError(str(error)) from None
     if getattr(message, "version", VERSION) != VERSION:
