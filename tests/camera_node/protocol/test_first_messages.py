@@ -24,7 +24,7 @@ ATTEMPTS = 8
 
 
 def test_threads_that_decode_a_kind_first_do_not_crash():
-    """A viewer ended with SIGSEGV a second after its start; 115 of 150 such programs do without the lock."""
+    """A viewer ended with SIGSEGV a second after its start; of 150 similar programs without the lock 115 do."""
     for _ in range(ATTEMPTS):
         done = subprocess.run(
             [sys.executable, "-c", FIRST_MESSAGES], capture_output=True, text=True, timeout=120, check=False
