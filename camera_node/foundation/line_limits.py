@@ -71,7 +71,7 @@ class _Pause:
         return self._last_s + self._quiet_s(self._pause_s)
 
     def at(self, now_s: float) -> float:
-        """What is left of the pause, s; 0 once nothing is left but the first one."""
+        """What is left of the pause, s; 0 after the quiet time that follows the shortest one."""
         pause_s, quiet_from_s = self._pause_s, self.quiet_from_s
         while pause_s and now_s >= quiet_from_s:
             pause_s = pause_s / 2 if pause_s > self._limits.pause_s else 0.0

@@ -44,7 +44,9 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
 PICTURE_S = 1.0  # between two pictures of a public recording
 # For the answer of a busy server, also after the end of a recording: without the robots there is no replay.
 ANSWER_S = 10.0
-CHANGE_S = 1.0  # for the answer after a change, at the end of a recording that has robots
+CHANGE_S = (
+    LONGEST_PAUSE_S  # for that after a change, at the end of a recording that has robots: one more request
+)
 NO_ROBOTS = "no robot is declared: a replay of this recording needs --robots robots.yaml"
 DETECTIONS, POSE, FRAMES = "/detections", "/pose", "/fusion/frames"  # the ends of keys
 KINDS = {DETECTIONS: Detections, POSE: RobotPose, FRAMES: FusedFrames}
@@ -155,7 +157,7 @@ class ArenaRecorder:
         """Write until `stop` is set, or for `seconds`; then write what was received before.
 
         A recording without robots ends up to `ANSWER_S` later, with those that the server did not send yet. Others wait
-        for a change of the robots only briefly: any client can publish a status that names robots of its own.
+        for a change of the robots up to `CHANGE_S`: any client can publish a status that names robots of its own.
 
         Raises:
             ConfigError: the disk is full; the file is closed.

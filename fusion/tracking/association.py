@@ -260,12 +260,12 @@ class OwnDetections:
         frames = np.where(displaced, 0, frames)
         cost = np.maximum(missing * MISSED, CHANGED).sum(1)
         fallen = (count.sum(1) > 0) & (missing.sum(1) > count.sum(1))
-        unseen = self._unseen & (count > 0) & ~fallen[:, None]
-        cluttered = self._cluttered(given) & (count > 0) & ~fallen[:, None] & ~unseen
-        partial = (missing > count) & (count > 0) & ~fallen[:, None] & ~unseen & ~cluttered
-        own = ~(
-            fallen[robot] | (unseen | cluttered | partial).ravel()[view] | displaced[view % self._shape[1]]
-        )
+        present = (count > 0) & ~fallen[:, None]
+        unseen = present & self._unseen
+        cluttered = present & ~unseen & self._cluttered(given)
+        partial = present & ~unseen & ~cluttered & (missing > count)
+        doubtful = unseen | cluttered | partial
+        own = ~(fallen[robot] | doubtful.ravel()[view] | displaced[view % self._shape[1]])
         # What a camera did not see before is judged given all that others see.
         no_robots = np.zeros_like(fallen)
         for doubts in (

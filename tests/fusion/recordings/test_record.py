@@ -74,7 +74,7 @@ def test_a_replay_repeats_the_poses(tmp_path):
 
 
 def test_a_replay_goes_on_after_a_frame_set_without_a_solution(monkeypatch: pytest.MonkeyPatch):
-    """As the server does; before, it ended with an exception."""
+    """As the server goes on; the replay ended with the exception."""
     track, numbers = Tracker.track, count()
 
     def without_a_covariance_once(self: Tracker, frame_set: FrameSet) -> TrackingResult:
@@ -111,7 +111,7 @@ def test_robots_that_are_declared_after_the_start_are_recorded(tmp_path, caplog:
 
 
 def test_a_forged_status_does_not_keep_the_recorder_from_ending(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    """It names robots that no server declares, and the server does not answer; ten seconds before."""
+    """It names robots that no server declares, and the server does not answer: the recorder waited ten seconds."""
     monkeypatch.setattr(arena_recording, "ANSWER_S", 100 * DEADLINE_S)
     stop, busy, release, path = threading.Event(), threading.Event(), threading.Event(), tmp_path / "x.mcap"
     with serving(config(tmp_path)) as (server, client), RecordingWriter(path) as writer:
