@@ -26,6 +26,7 @@ from fusion.tracking.result import CameraUse
 
 log = logging.getLogger("fusion")
 ON_TIME_S = 30.0  # without a late frame, after which a camera is on time again: at most two lines a minute
+LOGGED_LATE = 3  # late frames, each within `ON_TIME_S` of the last: a busy machine delays single ones
 SILENT_S = 2.0  # without a frame: a camera is gone
 PERIOD_NS = 1_000_000_000
 LATE = "frames that arrived too late"
@@ -160,7 +161,7 @@ class ServerStatistics:
         camera.has_two_publishers = has_two_publishers
 
     def note_late(self, name: str, age_ms: float, limit_ms: float) -> None:
-        """Count a camera's frame that came too late; log the first one, until none did for `ON_TIME_S`.
+        """Count a camera's frame that came too late; log number `LOGGED_LATE`, until none did for `ON_TIME_S`.
 
         Args:
             name: of the camera.
@@ -169,14 +170,14 @@ class ServerStatistics:
         """
         camera = self._cameras[name]
         if not camera.late_since_ns:
-            if age_ms > limit_ms:
-                late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
-                log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
-            else:
-                late = "%s: a frame came after later ones, %.0f ms old; such frames are dropped"
-                log.warning(late, name, age_ms, extra=self._about(name))
             camera.late_since_ns, camera.late_before = camera.last_ns, camera.late
         camera.late, camera.late_ns = camera.late + 1, camera.last_ns
+        if camera.late - camera.late_before == LOGGED_LATE and age_ms > limit_ms:
+            late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
+            log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
+        elif camera.late - camera.late_before == LOGGED_LATE:
+            late = "%s: a frame came after later ones, %.0f ms old; such frames are dropped"
+            log.warning(late, name, age_ms, extra=self._about(name))
         with self._lock:
             camera.skipped[LATE] += 1
 
@@ -188,8 +189,9 @@ class ServerStatistics:
         camera = self._cameras[name]
         if camera.late_since_ns and camera.last_ns - camera.late_ns > ON_TIME_S * 1e9:
             seconds, count = (camera.late_ns - camera.late_since_ns) * 1e-9, camera.late - camera.late_before
-            text = "%s is on time again: %d of its frames in %.0f s were too late and were dropped"
-            log.info(text, name, count, seconds, extra=self._about(name))
+            if count >= LOGGED_LATE:
+                text = "%s is on time again: %d of its frames in %.0f s were too late and were dropped"
+                log.info(text, name, count, seconds, extra=self._about(name))
             camera.late_since_ns = 0
 
     def count_frame_set(

@@ -105,7 +105,7 @@ class Queue:
         load: robots and cameras.
         seconds: of the load.
         pace: factor of the measured processor times, to simulate a faster or a slower machine.
-        use: is called with the time of a publication, and its poses.
+        use: is called with the time of a publication, and its poses, after the first `START_S` seconds.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Queue:
             first = list(update.poses.values())
             self._spend(lambda first=first: self._encode(first))
             done_ns = self.free_ns
-            if self._use is not None:
+            if self._use is not None and self._warm:
                 self._use(done_ns, first)
             result = self._spend(lambda update=update: self.tracker.finish(update))
             published = {pose.robot for pose in first}

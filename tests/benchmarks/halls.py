@@ -123,7 +123,7 @@ def use_of_poses(load: Load, seconds: float) -> Use:
         for message in load.messages(seconds):
             queue.step(message, message.t_ns + 5_000_000)
     at_ns = np.array([at for at, _ in published])
-    span_s = np.random.default_rng(0).uniform(START_S, seconds - 2 / load.hz, USES)
+    span_s = np.random.default_rng(0).uniform(START_S + 4 / load.hz, seconds - 2 / load.hz, USES)
     names = {name: k for k, name in enumerate(load.bodies)}
     ages_s, errors_m2 = [], []
     for s in span_s.tolist():

@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from fusion.server.server_statistics import ON_TIME_S, SILENT_S, PipelineStatus, ServerStatistics
+from fusion.server.server_statistics import LOGGED_LATE, ON_TIME_S, SILENT_S, PipelineStatus, ServerStatistics
 
 
 def test_a_retired_camera_is_listed_no_more_until_a_camera_has_its_name_again():
@@ -45,14 +45,30 @@ def test_a_camera_that_is_late_now_and_then_is_told_twice(caplog: pytest.LogCapt
         "cam0 is 390 ms late (limit 150 ms); its late frames are dropped",
         "cam0 is on time again: 300 of its frames in 60 s were too late and were dropped",
     ]
-    statistics.note_late("cam0", 390.0, 150.0)
+    for _ in range(LOGGED_LATE):
+        statistics.note_late("cam0", 390.0, 150.0)
     assert "390 ms late" in caplog.records[-1].getMessage()
+
+
+def test_single_late_frames_are_counted_and_not_logged(caplog: pytest.LogCaptureFixture):
+    """A busy machine delays one frame a minute for days: that is no state of the camera."""
+    statistics, second = ServerStatistics(), 10**9
+    caplog.set_level(logging.INFO, "fusion")
+    for k in range(1, 1 + 10 * round(2 * ON_TIME_S)):
+        statistics.count_arrival("cam0", k * second, k * second)
+        if k % round(2 * ON_TIME_S) == 0:
+            statistics.note_late("cam0", 390.0, 150.0)
+        else:
+            statistics.note_on_time("cam0")
+    assert statistics.report(k * second, PipelineStatus()).cameras["cam0"].late == 10
+    assert [record.getMessage() for record in caplog.records] == ["camera cam0 appeared"]
 
 
 def test_frames_that_come_after_later_ones_are_not_said_to_exceed_the_limit(caplog: pytest.LogCaptureFixture):
     statistics = ServerStatistics()
     statistics.count_arrival("cam0", 10**9, 10**9)
-    statistics.note_late("cam0", 60.0, 150.0)
+    for _ in range(LOGGED_LATE):
+        statistics.note_late("cam0", 60.0, 150.0)
     assert caplog.records[-1].getMessage() == (
         "cam0: a frame came after later ones, 60 ms old; such frames are dropped"
     )
