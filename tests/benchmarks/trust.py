@@ -26,7 +26,8 @@ from rich.table import Table
 from calib.rig.rig import Rig
 from camera_node.foundation.terminal import console, say, track
 from camera_node.geometry.pose import Pose, rotation_from_vector, vector_from_rotation
-from fusion.model.robots import Robot
+from fusion.errors import FusionError
+from fusion.model.robots import Robot, require_trackable
 from fusion.model.states import POSITION
 from fusion.protocol.pose_messages import RobotPose
 from tests.benchmarks.faults.judge import PoseJudge
@@ -187,25 +188,40 @@ def marker(mm: float) -> Kind:
     def make(load: Load, rng: np.random.Generator) -> Setting:
         name = str(rng.choice(list(load.bodies)))
         first, *others = load.bodies[name].markers
-        angle = rng.uniform(0, 2 * np.pi)
-        x, y = first[:2] + 1e-3 * mm * np.array([np.cos(angle), np.sin(angle)])
-        robot = msgspec.structs.replace(load.bodies[name], markers=((float(x), float(y), first[2]), *others))
-        robots = {**load.bodies, name: robot}
-        return Setting(Rig(cameras=load.rig), robots, guilty=frozenset({name}), in_files=True)
+        while True:
+            angle = rng.uniform(0, 2 * np.pi)
+            x, y = first[:2] + 1e-3 * mm * np.array([np.cos(angle), np.sin(angle)])
+            robot = msgspec.structs.replace(
+                load.bodies[name], markers=((float(x), float(y), first[2]), *others)
+            )
+            robots = {**load.bodies, name: robot}
+            if is_trackable(robots):
+                return Setting(Rig(cameras=load.rig), robots, guilty=frozenset({name}), in_files=True)
 
     return make
+
+
+def is_trackable(robots: dict[str, Robot]) -> bool:
+    """Whether a server takes them: a robot may be symmetric, or look like another one, once a marker is elsewhere."""
+    try:
+        require_trackable(robots, "")
+    except FusionError:
+        return False
+    return True
 
 
 def markers(sigma_mm: float) -> Kind:
     """All markers of all robots are off the places that `robots.yaml` states, as if measured by hand."""
 
     def make(load: Load, rng: np.random.Generator) -> Setting:
-        robots = {}
-        for name, robot in load.bodies.items():
-            off = 1e-3 * sigma_mm * rng.standard_normal((len(robot.markers), 3)) * (1.0, 1.0, 0.0)
-            moved = tuple(tuple((place + o).tolist()) for place, o in zip(robot.points, off, strict=True))
-            robots[name] = msgspec.structs.replace(robot, markers=moved)
-        return Setting(Rig(cameras=load.rig), robots, guilty=frozenset(robots), in_files=True)
+        while True:
+            robots = {}
+            for name, robot in load.bodies.items():
+                off = 1e-3 * sigma_mm * rng.standard_normal((len(robot.markers), 3)) * (1.0, 1.0, 0.0)
+                moved = tuple(tuple((place + o).tolist()) for place, o in zip(robot.points, off, strict=True))
+                robots[name] = msgspec.structs.replace(robot, markers=moved)
+            if is_trackable(robots):
+                return Setting(Rig(cameras=load.rig), robots, guilty=frozenset(robots), in_files=True)
 
     return make
 
@@ -424,6 +440,14 @@ def outcomes(wanted: Sequence[Case], jobs: int) -> Iterator[Outcome]:
             yield future.result()
 
 
+def _read(line: bytes) -> Outcome:
+    """An outcome of a file, where NaN is null."""
+    content = msgspec.json.decode(line)
+    content["ratios"] = [np.nan if ratio is None else ratio for ratio in content["ratios"]]
+    content["rms_mm"] = np.nan if content["rms_mm"] is None else content["rms_mm"]
+    return msgspec.convert(content, Outcome)
+
+
 def report(found: Sequence[Outcome], details: bool) -> int:
     """Print a row for each kind and ring; returns how many runs rewrote an innocent camera."""
     table = Table(
@@ -503,10 +527,12 @@ def main(
         sample: runs that are drawn, in place of those of a table.
         details: print what the server reported in each run.
         jobs: processes.
-        save: a file for the outcomes as JSON lines.
+        save: a file for the outcomes as JSON lines; those that it holds are not run again.
     """
-    found = []
     wanted = drawn(sample) if sample else cases(only, seeds, cameras, quick)
+    saved = save.read_bytes().splitlines() if save is not None and save.exists() else []
+    found = [o for o in map(_read, saved) if o.case in wanted]
+    wanted = [case for case in wanted if case not in {outcome.case for outcome in found}]
     for outcome in track(outcomes(wanted, jobs), "trust", len(wanted)):
         found.append(outcome)
         if save is not None:
