@@ -333,7 +333,8 @@ class RigMonitor:
         return CHECK_NS if is_urgent else max(CHECK_NS, self._pause_ns)
 
     def _exclude_displaced(self, displaced: Mapping[int, int]) -> ExtrinsicsCorrection | None:
-        if len(displaced) != 1:
+        """While cameras contradict each other, robots may be predicted by the one that moved."""
+        if len(displaced) != 1 or len(self.contradicting) > 1:
             return None
         ((k, n_sets),) = displaced.items()
         name = self._cameras.names[k]
