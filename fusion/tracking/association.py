@@ -17,8 +17,8 @@ prediction P, and the density of all roundels in the image:
 
 A robot of which much is missing needs more than what its missing markers cost: log(1 - P_D) each, and at most the
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
-probability that it does now. Where a camera shows the smaller part of what it usually shows of a robot, and in clutter,
-where other roundels are expected in gates, the nearest detection may be another's: there its view of the robot is
+probability that it does now. Where a camera shows the smaller part of what it usually shows of a robot, or at first of the
+markers that face it, and in clutter, where other roundels are expected in gates, the nearest detection may be another's: there its view of the robot is
 judged given what the other cameras see. A camera that alone shows most of what it usually sees elsewhere, all by one
 turn, was moved: what it still shows near the predictions is not theirs.
 """
@@ -263,7 +263,7 @@ class OwnDetections:
         present = (count > 0) & ~fallen[:, None]
         unseen = present & self._unseen
         cluttered = present & ~unseen & self._cluttered(given)
-        partial = present & ~unseen & ~cluttered & (missing > count)
+        partial = present & ~unseen & ~cluttered & ((missing > count) | self._shows_few(given, count))
         doubtful = unseen | cluttered | partial
         own = ~(fallen[robot] | doubtful.ravel()[view] | displaced[view % self._shape[1]])
         # What a camera did not see before is judged given all that others see.
@@ -277,6 +277,19 @@ class OwnDetections:
                 own[self._accepted(given, view, own, doubts)] = True
         self._learn(self._count(view[own]), frames, given.tracked)
         return own
+
+    def _shows_few(self, given: AssignedFrames, count: Index) -> Mask:
+        """(R, C) first views of robots that show the smaller part of the markers that face the camera: nothing is usual
+        yet, and what is not theirs would become it."""
+        found, exposures = np.zeros(self._shape, bool), given.detections.exposures
+        first = (self._learned == 0) & (count > 0)
+        for k in np.flatnonzero(first.any(0)).tolist():
+            tau = float(exposures.tau[exposures.camera == k][-1])
+            markers = self._markers, np.flatnonzero(first[self._markers.robot, k])
+            expected = ExpectedViews.of(self._cameras, self._cameras.names[k], given.states, tau, markers)
+            facing = np.bincount(self._markers.robot[expected.rows], minlength=self._shape[0])
+            found[:, k] = first[:, k] & (facing > 2 * count[:, k])
+        return found
 
     def _cluttered(self, given: AssignedFrames) -> Mask:
         """(R, C) views in which other roundels are expected in the gate of a marker, as wide as that of its robot."""

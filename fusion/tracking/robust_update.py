@@ -28,7 +28,7 @@ from fusion.model.observations import (
     mean_by_body,
     views,
 )
-from fusion.model.states import States
+from fusion.model.states import POSITION, States
 from fusion.monitoring.residual_monitor import LEARNED, ResidualMonitor, camera_at_fault
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
@@ -37,9 +37,9 @@ from fusion.tracking.rays import GATE
 
 # Squared residual over that of calibration errors, from which a robot's detections are compared.
 SUSPICIOUS = 4.0
-# Correction of a pose or a velocity in standard deviations of its prediction, from which a robot's detections are
-# compared although they fit: a false one may have changed the velocity.
-LARGE_CORRECTION = 3.0
+# Correction of a position in standard deviations of its prediction: those of frames 33 ms apart have 11 mm. No false
+# roundel has displaced a robot by more than its correction and the error of its prediction.
+MIN_CORRECTION = 0.5
 MAX_ADDED_PX2 = 32.0**2  # noise that makes anything usual within the gates of association
 CONTRADICTED = 0.5  # share of a robot's detections with a large misfit, above which none of them is its own
 A_VIEW = 0.25  # the same, from which the view of a camera may be wrong: most robots are seen by four or fewer
@@ -241,19 +241,19 @@ class RobustUpdate:
     def _without_incompatible(self, fitted: RobustFit) -> RobustFit:
         """The fit to detections that do not contradict the others of their robots; all keep their residuals.
 
-        Cauchy's kernel gives the others little weight, but their pull falls with the inverse of their distance only,
-        and nothing resists where the other detections do not determine the velocity.
+        A robot whose compatible detections fit already stays as it is: the others have hardly any weight.
         """
         slack_px2 = self._residuals.slack_px**2, fitted.added_px2
         detections, robot = fitted.detections, self._markers.robot[fitted.assignments.marker]
         suspicious = fitted.assignments.squared_px > SUSPICIOUS * sum(slack_px2)
-        displaced = np.union1d(robot[suspicious], self._corrected(fitted))
-        rows = np.flatnonzero(np.isin(robot, displaced))
+        if not suspicious.any():
+            return fitted
+        rows = np.flatnonzero(self._may_be_displaced(fitted, robot[suspicious])[robot])
         if not len(rows):
             return fitted
         observations = MatchedObservations.of(fitted.assignments.select(rows), detections, self._markers)
         compatible = jointly_compatible(self._estimator, fitted.prediction, observations, *slack_px2)
-        displaced = np.unique(robot[rows[~compatible]])
+        displaced = np.intersect1d(robot[rows[~compatible]], robot[rows[compatible & suspicious[rows]]])
         if not len(displaced):
             return fitted
         again = np.isin(robot[rows], displaced)
@@ -268,13 +268,13 @@ class RobustUpdate:
         assignments = replace(fitted.assignments, squared_px=squared_px)
         return replace(fitted, states=states, assignments=assignments, equations=equations, weights=weights)
 
-    @staticmethod
-    def _corrected(fitted: RobustFit) -> Index:
-        """The robots that the update moved far from their predictions, or gave other velocities."""
+    def _may_be_displaced(self, fitted: RobustFit, robots: Index) -> Mask:
+        """(R,) the given ones of all robots that the update moved from their predictions."""
         states = fitted.prediction.states
-        step = fitted.states.minus(states).reshape(-1, 4, 3)
-        variance = np.diagonal(states.P, axis1=1, axis2=2).reshape(-1, 4, 3).mean(2)
-        return np.flatnonzero(np.any(np.sum(step**2, 2) > LARGE_CORRECTION**2 * variance, axis=1))
+        moved = np.zeros(len(states), bool)
+        moved[robots] = True
+        variance = np.einsum("nii->n", states.P[:, POSITION, POSITION]) / 3
+        return moved & (np.sum((fitted.states.p - states.p) ** 2, 1) > MIN_CORRECTION**2 * variance)
 
 
 def jointly_compatible(
