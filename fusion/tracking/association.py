@@ -17,10 +17,10 @@ prediction P, and the density of all roundels in the image:
 
 A robot of which much is missing needs more than what its missing markers cost: log(1 - P_D) each, and at most the
 probability that something hides them from a camera. A camera that did not see the robot needs more than the
-probability that it does now. Where a camera shows the smaller part of what it usually shows of a robot, or at first of the
-markers that face it, and in clutter, where other roundels are expected in gates, the nearest detection may be another's: there its view of the robot is
-judged given what the other cameras see. A camera that alone shows most of what it usually sees elsewhere, all by one
-turn, was moved: what it still shows near the predictions is not theirs.
+probability that it does now. Where a camera shows the smaller part of what it usually shows of a robot, or at first of
+the markers that face it, and in clutter, where other roundels are expected in gates, the nearest detection may be
+another's: there its view of the robot is judged given what the other cameras see. A camera that alone shows most of
+what it usually sees elsewhere, all by one turn, was moved: what it still shows near the predictions is not theirs.
 """
 
 from collections.abc import Sequence
