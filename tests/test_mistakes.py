@@ -155,6 +155,7 @@ REMEDIES: dict[str, str | tuple[str, str]] = {
     "a picture that is not there": ("nort.png", "sample/frames/north"),
     "a text file": ("notes.txt", "sample/frames/north"),
     "the folder of all cameras": ("sample/frames", "sample/frames/east"),
+    "the folder of the sample": ("sample", "sample/frames/north"),
     "a file for several drawings": ("seen.png", "seen"),
     "a camera that the rig lacks": ("nord", "north"),
     "millimetres in place of metres": ("120", "0.12"),
@@ -172,6 +173,7 @@ REMEDIES: dict[str, str | tuple[str, str]] = {
     "a rig as a recording": REPLAY,
     "a text file as a recording": ("text.mcap", "sample/recording.mcap"),
     "an empty file as a recording": REPLAY,
+    "a rig as a plan": ("plan", "plan --rig"),
     "a recording as a folder of frames": RUN,
     "a broken YAML file": RUN,
     "a tab in a YAML file": ("tab.yaml", "indented.yaml"),
@@ -214,6 +216,7 @@ REMEDIES: dict[str, str | tuple[str, str]] = {
         "wand.mcap --rig sample/rig.yaml --robots sample/robots.yaml",
     ),
     "the recording as its own result": ("--out sample/recording.mcap", "--out poses.mcap"),
+    "a part before the beginning": ("-3", "1"),
     "a part after the end": ("100", "1"),
     "a part that ends before it begins": ("--from-s 3", "--force --from-s 1"),
     "a part over another recording": ("sample/wand.mcap", "part2.mcap"),
@@ -231,9 +234,12 @@ LIVE_REMEDIES: dict[str, str | tuple[str, str]] = {
     "no server": ("--timeout-s 1", ""),
     "a size of millimetres": ("--diameter 90 --at 0 0 0", "--diameter 0.12 --at -0.4 0.2 0.3"),
     "a folder without recordings": "roundel record recorded/today.mcap --seconds 1",
+    "a recording without suffix": ("monday", "monday.mcap"),
     "a misspelt camera in a rename": ("nort", "north"),
     "a name that no camera can have": ('north "north door"', "x north_door"),
     "an arena of another name": ("--arena demo --timeout-s 1", ""),
+    "a rename without the new name": ("rename x", "rename north_door x"),
+    "a turn without the angle": ("turn a", "turn a 90"),
     "a misspelt robot in a removal": ("aa", "a"),
 }
 # All of them lead to one command.
@@ -345,6 +351,8 @@ def test_the_remedies_work_in_a_running_arena(corrected: Path, monkeypatch: pyte
         for command in followed(LIVE_REMEDIES):
             words = shlex.split(command)[1:]
             assert execute(*words, "--connect", endpoint, "--arena", "test") != 2, command
+        for command in ("cameras", "robots"):  # without an action, which is list then
+            assert execute(command, "--connect", endpoint, "--arena", "test") == 0
     assert execute("recordings", "list", "recorded") == 0
 
 

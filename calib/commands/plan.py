@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`roundel plan`: coverage and expected precision of an arena, planned or calibrated, and where to mount cameras."""
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +21,7 @@ from calib.plan.planner import PlannedArena, evaluate, plan_around
 from calib.rig.camera import Camera
 from calib.rig.rig import load_rig
 from camera_node.foundation.config import dump_yaml, example_file, load_yaml, write_atomically
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.errors import ConfigError, RoundelError
 from camera_node.foundation.terminal import progress_bar, say
 
 
@@ -63,7 +64,7 @@ class PlanArena:
     def _arena(self) -> PlannedArena:
         """The cameras to evaluate: suggested, calibrated, or those of the plan."""
         rig = {} if self.rig is None else load_rig(self.rig).require_placed(self.rig)
-        plan = self._plan_of_rig(rig) if self.plan is None else load_yaml(self.plan, Plan)
+        plan = self._plan_of_rig(rig) if self.plan is None else _load_plan(self.plan)
         if self.suggest is not None:
             return self._suggest(plan, self.suggest)
         if rig:
@@ -121,6 +122,24 @@ def planned_cameras(placement: SuggestedPlaces, kind: CameraKind) -> dict[str, P
         f"camera-{k}": PlannedCamera(**fields, position_m=_rounded(position), look_at_m=_rounded(aim))
         for k, (position, aim) in enumerate(pairs, 1)
     }
+
+
+def _load_plan(path: Path) -> Plan:
+    """Read a plan; the error of a rig in its place names the option for rigs."""
+    try:
+        return load_yaml(path, Plan)
+    except ConfigError as error:
+        if not _is_rig(path):
+            raise
+        raise ConfigError(
+            f"{path} describes calibrated cameras (rig.yaml); give it as --rig {path}"
+        ) from error
+
+
+def _is_rig(path: Path) -> bool:
+    with contextlib.suppress(RoundelError):
+        return bool(load_rig(path).cameras)
+    return False
 
 
 def list_catalogue() -> None:

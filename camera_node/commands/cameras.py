@@ -20,7 +20,7 @@ N_ARGUMENTS = {"list": (0,), "rename": (2,), "forget": (1,), "why": (1, 2)}
 
 
 def cameras(
-    action: Literal["list", "rename", "forget", "why"],
+    action: Literal["list", "rename", "forget", "why"] = "list",
     arguments: tuple[str, ...] = (),
     /,
     *,
@@ -36,7 +36,9 @@ def cameras(
     if action == "rename" and len(arguments) == 2:
         require_name(arguments[1], "a camera")
     if len(arguments) not in N_ARGUMENTS[action]:
-        raise ConfigError(f"{len(arguments)} arguments; use roundel cameras {action} {USES[action]}".rstrip())
+        raise ConfigError(
+            f"words after {action}: {len(arguments)}; use roundel cameras {action} {USES[action]}".rstrip()
+        )
     with connection.open() as session:
         if action == "why":
             name = require_name(arguments[0], "a camera")

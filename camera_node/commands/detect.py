@@ -21,7 +21,7 @@ from camera_node.foundation.arrays import Grey
 from camera_node.foundation.errors import CameraError, ConfigError, describe_failed_write
 from camera_node.foundation.terminal import console, say
 from camera_node.geometry.lens import Lens, load_lens
-from camera_node.sources.recorded_frames import inner_folders, read_grey
+from camera_node.sources.recorded_frames import read_grey
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")  # of the pictures of a folder
 PASSES = 2  # over a picture: the first one learns prints and tone curve
@@ -133,12 +133,21 @@ def _pictures(paths: tuple[Path, ...]) -> Iterator[Path]:
         if not path.is_dir():
             yield path
             continue
-        inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in SUFFIXES]
+        inside = _pictures_in(path)
         if not inside:
-            raise CameraError(
-                f"{path} has no picture; {inner_folders(path) or 'it needs files such as .png'}"
-            )
+            raise CameraError(f"{path} has no picture; {_folder_with_pictures(path)}")
         yield from inside
+
+
+def _pictures_in(folder: Path) -> list[Path]:
+    return [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES]
+
+
+def _folder_with_pictures(folder: Path) -> str:
+    """The advice to give the first folder with pictures inside this one, or inside a folder of it."""
+    inner = (path for pattern in ("*", "*/*") for path in sorted(folder.glob(pattern)) if path.is_dir())
+    found = next((path for path in inner if _pictures_in(path)), None)
+    return f"it has folders: give {found}" if found else "it needs files such as .png"
 
 
 def _make_folder(path: Path, n_images: int) -> None:

@@ -35,7 +35,7 @@ COUNTS = {
 
 
 def robots(
-    action: Literal["list", "rename", "remove", "pivot", "turn", "save"],
+    action: Literal["list", "rename", "remove", "pivot", "turn", "save"] = "list",
     arguments: tuple[str, ...] = (),
     /,
     *,
@@ -54,7 +54,9 @@ def robots(
     """
     counts = COUNTS[action]
     if not counts[0] <= len(arguments) <= counts[1]:
-        raise ConfigError(f"{len(arguments)} arguments; use roundel robots {action} {USES[action]}".rstrip())
+        raise ConfigError(
+            f"words after {action}: {len(arguments)}; use roundel robots {action} {USES[action]}".rstrip()
+        )
     if action == "save" and Path(arguments[0]).exists() and not force:
         raise ConfigError(f"{arguments[0]} exists; add --force to overwrite it, or name another file")
     with connection.open() as session:

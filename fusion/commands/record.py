@@ -4,11 +4,14 @@
 from pathlib import Path
 
 from calib.rig.recording import RecordingWriter
+from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder
 from fusion.recordings.rotation import RotatingWriter, Rotation
+
+SUFFIX = ".mcap"  # of the files that `roundel recordings list` and the page show
 
 
 def record(
@@ -34,6 +37,8 @@ def record(
             can repeat and judge what it shows (docs/benchmark.md).
         force: replace an existing file.
     """
+    if out.suffix != SUFFIX:
+        raise ConfigError(f"{out} does not end in {SUFFIX}; write {out.with_name(out.name + SUFFIX)}")
     rotation = Rotation(rotate_mb, rotate_minutes)
     opened = RotatingWriter(out, rotation) if rotation else RecordingWriter(out, overwrite=force)
     with (

@@ -30,7 +30,9 @@ def recordings(
     """
     counts = COUNTS[action]
     if not counts[0] <= len(arguments) <= counts[1]:
-        raise ConfigError(f"{len(arguments)} arguments; use roundel recordings {action} {USES[action]}")
+        raise ConfigError(
+            f"words after {action}: {len(arguments)}; use roundel recordings {action} {USES[action]}"
+        )
     paths = [Path(word) for word in arguments]
     if action == "rename":
         say(f"{paths[0]} is called {rename_recording(paths[0], arguments[1])} from now on")

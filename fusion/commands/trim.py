@@ -23,6 +23,8 @@ def trim(
     """
     if out.exists() and recording.exists() and out.samefile(recording):
         raise ConfigError(f"{out} is the recording itself; give another file")
+    if from_s < 0:
+        raise ConfigError(f"--from-s is {from_s:g}; the recording begins at 0 s")
     faults = Counter[str]()
     count = trim_recording(recording, out, from_s, to_s, faults, overwrite=force)
     say_skipped(faults)

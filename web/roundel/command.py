@@ -50,7 +50,9 @@ def main() -> None:
 
 def execute(*arguments: str) -> int | None:
     """Run a command line; return its exit code."""
-    if arguments == ("--version",):
+    if arguments[:1] == ("help",):
+        arguments = (*arguments[1:], "--help")
+    if arguments in (("--version",), ("version",)):
         from importlib.metadata import version
 
         print(f"roundel {version('roundel')}")

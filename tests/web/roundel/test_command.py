@@ -42,6 +42,19 @@ def test_the_list_of_commands_is_complete(tmp_path: Path):
     assert [name for name in listed if name in WORK] == list(WORK)
 
 
+@pytest.mark.parametrize(
+    ("words", "same"), [("help", "--help"), ("help trim", "trim --help"), ("version", "--version")]
+)
+def test_help_and_version_are_commands_too(words: str, same: str, capsys: pytest.CaptureFixture[str]):
+    """`roundel help` advised `health`, and `roundel version` advised `verify`."""
+    said = []
+    for line in (words, same):
+        with contextlib.suppress(SystemExit):
+            assert execute(*line.split()) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1] != ""
+
+
 @pytest.mark.parametrize(("words", "command"), with_groups(COMMANDS))
 def test_help_has_examples(words: str, command: Command, capsys: pytest.CaptureFixture[str]):
     """Each command's help shows its examples, complete and on a line of their own."""
