@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Tables, coloured texts and the style of the page, as HTML. All texts are escaped."""
+"""Tables, coloured texts, the style of the page and its script, as HTML. All texts are escaped."""
 
 import base64
+import gzip
 import html
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from websockets.http11 import Response
 
 from calib.rig.coverage import Coverage
 
@@ -30,6 +33,26 @@ th[title] {{ cursor: help; text-decoration: underline dotted #8886; text-underli
 .roundel-pictures figure {{ margin: 0; font-size: 11px }}
 .roundel-pictures img {{ width: 100%; display: block; border-radius: 3px; background: #000; min-height: 60px }}
 </style>"""
+# The folders of Viser react to the pointer only. Here the title of each is a button: Tab reaches it, Enter and Space
+# act as a click.
+FOLDER = ".mantine-Paper-root:has(> .tabler-icon-chevron-down, > .tabler-icon-chevron-up)"
+FOLDER_KEYS = f"""<script>
+(() => {{
+  const describe = title => {{
+    title.tabIndex = 0;
+    title.setAttribute("role", "button");
+    title.setAttribute("aria-expanded", String(title.querySelector(".tabler-icon-chevron-up") !== null));
+  }};
+  const describeAll = () => document.querySelectorAll("{FOLDER}").forEach(describe);
+  new MutationObserver(describeAll).observe(document, {{childList: true, subtree: true}});
+  document.addEventListener("keydown", event => {{
+    if (!["Enter", " "].includes(event.key) || !event.target.matches("{FOLDER}")) return;
+    event.preventDefault();
+    event.target.click();
+  }});
+}})();
+</script>
+"""
 READ_ONLY_STYLE = """<style>
 .mantine-Button-root, input, textarea, .mantine-Checkbox-root, .mantine-Slider-root, .mantine-Select-root {
   opacity: .45; pointer-events: none }
@@ -134,3 +157,19 @@ def status_line(level: str, text: str) -> str:
         "font-size:13px;line-height:1.35;border-radius:2px"
     )
     return f'<div role="status" data-level="{level}" style="{style}">{html.escape(text)}</div>'
+
+
+def add_folder_keys(response: Response) -> None:
+    """Put the script into an HTML document that is about to be sent; other files stay as they are."""
+    if response.status_code != 200 or "html" not in response.headers.get("Content-Type", ""):
+        return
+    response.body = _with_script(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+
+
+@lru_cache(maxsize=2)  # compressed or not; the document is the same for all browsers
+def _with_script(document: bytes, is_compressed: bool) -> bytes:
+    text = gzip.decompress(document) if is_compressed else document
+    text = text.replace(b"</head>", FOLDER_KEYS.encode() + b"</head>", 1)
+    return gzip.compress(text) if is_compressed else text

@@ -31,6 +31,7 @@ from websockets.typing import Data
 from camera_node.foundation.config import load_yaml
 from camera_node.foundation.errors import ConfigError, printable, unwritable
 from web.errors import WebError
+from web.html_tables import add_folder_keys
 
 log = logging.getLogger("web.page")
 
@@ -195,6 +196,7 @@ class PageAccess:
             response.headers["Cache-Control"] = "no-store"
             response.headers["Set-Cookie"] = f"{self._cookie_name}={token}; Path=/; HttpOnly; SameSite=Lax"
         if response is not None:
+            add_folder_keys(response)
             response.headers.update(HEADERS)
         return response
 

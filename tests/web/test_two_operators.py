@@ -11,14 +11,17 @@ from playwright.sync_api import Locator, Page
 
 from camera_node.protocol.server_connection import ServerConnection
 from fusion.client.arena import Arena as Client
+from fusion.model.robots import turn_heading
 from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import TRIANGLE, WIDE
 from tests.waiting import wait_for
 from tests.web.browser import browsing, drawing, loopback, value_of
-from web.page import add_live_page
+from web.page import TABS, add_live_page
 from web.state.feed import Feed
 from web.state.subscription import Subscription
 from web.view import View
+
+MAX_CONTROLS = 60  # of the page, more than it has
 
 
 @pytest.fixture
@@ -77,6 +80,40 @@ def test_each_operator_sees_the_other_s_changes_and_keeps_its_own_text(arena: tu
         other.get_by_text("was renamed or removed meanwhile: choose one").wait_for()
         assert field(other, "New name").input_value() == "truck"
         assert set(client.declared_robots().robots) == {"a"}
+
+
+def test_the_keyboard_alone_turns_a_robot(arena: tuple[Client, View]):
+    """From tab to tab with arrows, Tab to a folder, which Enter opens and Space closes, and on to its buttons."""
+    client, view = arena
+    with browsing(view) as page:
+        page.get_by_role("tab", name="Cameras").focus()
+        for _ in TABS[: TABS.index("Robots")]:
+            page.keyboard.press("ArrowRight")
+        page.keyboard.press("Enter")
+        folder = page.get_by_role("button", name="One robot", exact=True)
+        folder.wait_for()
+        press_tab_until(page, folder)
+        page.keyboard.press("Enter")
+        turn = page.get_by_role("button", name="Turn the heading")
+        turn.wait_for()
+        assert folder.get_attribute("aria-expanded") == "true"
+        page.keyboard.press("Space")
+        turn.wait_for(state="hidden")
+        page.keyboard.press("Space")
+        turn.wait_for()
+        press_tab_until(page, turn)
+        page.keyboard.press("Enter")
+        page.get_by_text("turned by 90 degrees").first.wait_for()
+        assert client.declared_robots().robots["a"] == turn_heading(TRIANGLE, 90.0)
+
+
+def press_tab_until(page: Page, control: Locator) -> None:
+    """Press Tab until a control has the focus."""
+    for _ in range(MAX_CONTROLS):
+        page.keyboard.press("Tab")
+        if control.evaluate("control => control === document.activeElement"):
+            return
+    raise AssertionError(f"Tab does not reach {control}")
 
 
 def test_robots_are_selected_together_and_keys_act(arena: tuple[Client, View]):
