@@ -32,6 +32,7 @@ def test_from_unknown_cameras_to_poses_with_two_commands_and_the_page(tmp_path: 
         assert arena.up.stop() == 0
     assert re.search("found arena 'arena' at tcp/", arena.camera.text)
     assert outcome.clicks - outcome.repeated <= MAX_CLICKS
+    assert outcome.seconds < MAX_S * arena.times
     assert abs(outcome.circle.radius_m - RADIUS_M) < 1e-3 * outcome.expected_mm
     # The L-frame's roundels, which fix the origin, have the same errors as the robot's.
     assert np.linalg.norm(outcome.circle.centre_m - CENTRE_M) < 2e-3 * outcome.expected_mm
@@ -42,5 +43,5 @@ def test_from_unknown_cameras_to_poses_with_two_commands_and_the_page(tmp_path: 
     assert list(yaml.safe_load((lab / "robots.yaml").read_text())["robots"]) == ["rover"]
 
 
-MAX_CLICKS = 15  # the goal of the first hour
+MAX_CLICKS, MAX_S = 15, 300.0  # the goals of the first hour; the motions last longer on a loaded machine
 PIXEL_MM = 1e3 * 3.0 / 565.0  # at 3 m
