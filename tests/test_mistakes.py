@@ -247,6 +247,7 @@ STARTED = (
     "text where a number belongs",
     "a name with a space",
     "a port that there is not",
+    "an address that is a port only",
     "a server without a file of robots",
 )
 WITHOUT_ADVICE = ("nothing to undo", "undo without a change")

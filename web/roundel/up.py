@@ -19,6 +19,7 @@ from camera_node.foundation.service import ServiceManager, stopped_by_signals
 from camera_node.foundation.supervisor import Supervisor
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER
+from camera_node.protocol.session import ENDPOINT
 from camera_node.sources.frame import SourceSettings
 from fusion.server.arena_config import ArenaConfig, in_zone, load_arena
 from web.arena_folder import ArenaFolder
@@ -60,6 +61,8 @@ class RunArena:
         """Run until stopped; return the exit code."""
         if not self.headless:
             check_port(self.host, self.port)
+        if self.listen is not None and not ENDPOINT.fullmatch(self.listen):
+            raise ConfigError(f"--listen {self.listen} is no endpoint; give one such as tcp/0.0.0.0:7447")
         folder = ArenaFolder(self.folder)
         is_new = folder.create(self.arena or LOCAL_SERVER.arena, self.listen, self.local)
         config = in_zone(load_arena(folder.config), self.zone)
