@@ -630,8 +630,13 @@ def explain_failure(
     a, b = divmod(int(pairs.argmax()), len(pairs))
     frames = ", ".join(f"{name} {n}" for name, n in zip(names, counts, strict=True))
     remedy = "measure the wand and" if pairs.max() >= MIN_FRAME_SETS else "wave it where views overlap, and"
+    seen = (
+        f"'{names[a]}' and '{names[b]}' saw the wand at once in {pairs.max()} frame sets, others in fewer"
+        if pairs.any()
+        else "no two saw the wand at once in any frame set"
+    )
     return (
-        f"no two cameras could be placed: '{names[a]}' and '{names[b]}' saw the wand at once in {pairs.max()} frame "
-        f"sets, others in fewer, and {MIN_FRAME_SETS} that fit one wand are needed (frames with the wand: {frames}); "
+        f"no two cameras could be placed: {seen}, and {MIN_FRAME_SETS} that fit one wand are needed (frames with the "
+        f"wand: {frames}); "
         f"{remedy} check the diameter and the markers of the wand file, and the intrinsics"
     )

@@ -179,6 +179,10 @@ class Detector:
 
 
 def _as_rows(image: Grey) -> Grey:
+    if not isinstance(image, np.ndarray):
+        raise TypeError(
+            f"image is {type(image).__name__}; give an array (cv2.imread returns None where there is no picture)"
+        )
     if image.dtype != np.uint8 or image.ndim != 2:
         raise ValueError(f"image is {image.dtype} {image.shape}; convert it to uint8 (h, w) with to_grey")
     return image if image.strides[1] == 1 else np.ascontiguousarray(image)

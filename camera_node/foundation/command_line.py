@@ -32,6 +32,9 @@ RULE = re.compile(r"\n\s*─+\s*\n")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 ENTRY = re.compile(r"^ {4}(\S.*)\n((?: {5,}.*\n?)*)", re.MULTILINE)  # a missing option and its help
 UNION = re.compile(r": no type matching .* '([^']*)' is not a number")
+COUNT = re.compile(
+    r": no type matching .* instantiated from \[(.*?)\].* did not match expected argument count (\d+).*"
+)
 NUMBER = re.compile(r"(?:invalid literal for int\(\) with base 10|could not convert string to float): (.*)")
 
 
@@ -263,6 +266,7 @@ def _summary(text: str) -> str:
         return f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
     line = " ".join(fault.split()).removeprefix("Error parsing ")
     line = re.sub(r"^Unrecognized options: (.*)", r"'\1' was not expected", line)
+    line = COUNT.sub(r" takes \2 values with a space between them, and got \1", line)
     return UNION.sub(r" '\1' is not a number", NUMBER.sub(r"\1 is not a number", line))
 
 

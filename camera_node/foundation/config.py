@@ -121,7 +121,9 @@ def _suggest(kind: type, fault: str) -> str:
     """For an unknown field: the known field with the most similar name, or all known fields. For a text in place of a
     number, such as 9 cm, or a number in place of a list: how to write it. Empty for other faults."""
     if re.match("Expected `(int|float)[^`]*`, got `str`", fault):
-        return "; give a number, without quotes and without a unit"
+        return "; give a number such as 0.12, without a comma, quotes and a unit"
+    if re.match("Expected `object[^`]*`, got `array`", fault):
+        return "; give names there, each with a colon and without a dash before it"
     if re.match("Expected `array[^`]*`, got `(int|float)`", fault):
         return "; give a list there, such as [[x, y, z]] for one marker"
     match = re.fullmatch(r"Object contains unknown field `([^`]*)`(?: - at `\$(.*)`)?", fault)

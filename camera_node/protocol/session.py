@@ -62,6 +62,10 @@ def open_router(
         NetworkError: an endpoint is invalid, or a certificate is missing.
         ConfigError: the Zenoh configuration is missing or invalid.
     """
+    if wrong := [endpoint for endpoint in listen if not ENDPOINT.fullmatch(endpoint)]:
+        raise NetworkError(
+            f"can't listen on '{wrong[0]}': give an endpoint such as tcp/0.0.0.0:7447 (--listen)"
+        )
     # With a listening timeout other than 0, opening succeeds although the port is taken.
     options = {
         "mode": "router",

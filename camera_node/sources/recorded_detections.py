@@ -15,7 +15,7 @@ from camera_node.foundation.config import require_name, write_table
 from camera_node.foundation.errors import CameraError, ConfigError
 from camera_node.foundation.terminal import track
 from camera_node.protocol.messages import Detections
-from camera_node.sources.recorded_frames import FrameFolder, VideoFile, inner_folders
+from camera_node.sources.recorded_frames import IMAGES, FrameFolder, VideoFile, inner_folders
 
 SIGMA_PX = 0.3  # assumed standard deviation of a centre from a file without covariances
 MAX_FPS = 1e5
@@ -38,9 +38,13 @@ def detect_frames(folder: Path, **settings) -> list[Detections]:
         )
     names = sorted(path.name for path in folder.iterdir() if path.is_dir())
     if not names:
-        raise CameraError(
-            f"{folder} contains no camera's folder; frames are expected as {folder}/<camera>/<t_ns>.png"
+        has_frames = any(path.suffix.lower() in IMAGES for path in folder.iterdir())
+        where = (
+            f"it has the pictures of one camera: give the folder around it, {folder.absolute().parent}"
+            if has_frames
+            else f"frames are expected as {folder}/<camera>/<t_ns>.png"
         )
+        raise CameraError(f"{folder} contains no camera's folder; {where}")
     if nested := [name for name in names if inner_folders(folder / name)]:
         raise CameraError(
             f"{folder / nested[0]} has folders in place of frames; give the folder whose folders are the cameras, "

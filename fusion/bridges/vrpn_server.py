@@ -302,7 +302,7 @@ def pack(parts: list[bytes], size: int) -> list[bytes]:
 def _listen(host: str, port: int) -> tuple[socket.socket, socket.socket]:
     """Sockets of TCP and UDP on the same port."""
     if not 0 <= port < 1 << 16:
-        raise ConfigError(f"--port {port} is none; give a port from 1 to 65535, such as 3883")
+        raise ConfigError(f"--port {port} is not a port; give one from 1 to 65535, such as 3883")
     listener, datagrams = socket.socket(), socket.socket(type=socket.SOCK_DGRAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
