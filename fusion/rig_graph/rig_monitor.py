@@ -374,13 +374,14 @@ class RigMonitor:
             return self._returned(window)
         if verdict.cause != "pose" or names[0] in self.pinned:
             return ()
-        name, k = names[0], verdict.cameras[0]
-        changes = () if name in self.excluded else (ExtrinsicsCorrection(name, None),)
-        self.excluded.add(name)
-        placed = self._place(window, verdict.fit, k) if recalibrates and verdict.is_pose_known else None
+        moved = [name for name in names if name not in self.pinned]
+        changes = tuple(ExtrinsicsCorrection(name, None) for name in moved if name not in self.excluded)
+        self.excluded.update(moved)
+        known = recalibrates and verdict.is_pose_known
+        placed = self._place(window, verdict.fit, verdict.cameras[0]) if known else None
         if placed is None:
             return changes
-        self._use(name)
+        self._use(names[0])
         return (*changes, placed)
 
     def _refine(self, window: Window, verdict: Verdict, measured: Measured | None) -> RigRefinement | None:

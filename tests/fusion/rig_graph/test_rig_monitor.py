@@ -340,6 +340,15 @@ def test_a_displaced_camera_is_not_excluded_while_cameras_contradict_each_other(
     assert not any(ratio > 2.0 for ratio in outcome.ratios)  # NaN: not tracked
 
 
+@pytest.mark.ci
+def test_two_cameras_that_moved_together_are_excluded_together():
+    """Of a pair on one bar the first one was: poses by the second one were up to 130 mm off until it was judged."""
+    outcome = run(Case(kind="bar 0.5 deg", cameras=6, seed=4, robots=1))
+    assert outcome.report == "right", outcome.lines
+    assert all("was moved" in line for line in outcome.lines[:2]), outcome.lines
+    assert max(outcome.ratios[1:]) < 2.0
+
+
 @pytest.mark.slow
 def test_robots_at_rest_show_no_clock():
     """Noise was their velocity: a camera that turned by 0.1 degrees got a clock of 1.3 s, and a good clock drifted."""
