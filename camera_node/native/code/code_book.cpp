@@ -8,7 +8,7 @@ namespace roundel {
 
 namespace {
 
-constexpr int kDistance = 4, kArcs = 3;
+constexpr int kArcs = 3;
 
 int distance(Word a, Word b) { return std::popcount(a ^ b); }
 
@@ -20,17 +20,17 @@ Word mirrored(Word word) {
 
 /// Whether the word differs enough from all turns of another one.
 bool differs(Word word, Word other) {
-    if (std::abs(std::popcount(word) - std::popcount(other)) >= kDistance) return true;
+    if (std::abs(std::popcount(word) - std::popcount(other)) >= kCodeDistance) return true;
     for (int s = 0; s < kCodeSectors; ++s)
-        if (distance(word, turned(other, s)) < kDistance) return false;
+        if (distance(word, turned(other, s)) < kCodeDistance) return false;
     return true;
 }
 
 bool is_possible(Word word) {
     const int black = std::popcount(word), arcs = distance(word, turned(word, 1)) / 2;
-    if (std::min(black, kCodeSectors - black) < kDistance || arcs < kArcs) return false;
+    if (std::min(black, kCodeSectors - black) < kCodeDistance || arcs < kArcs) return false;
     for (int s = 1; s < kCodeSectors; ++s)
-        if (turned(word, s) < word || distance(word, turned(word, s)) < kDistance) return false;
+        if (turned(word, s) < word || distance(word, turned(word, s)) < kCodeDistance) return false;
     return differs(word, mirrored(word));
 }
 

@@ -10,6 +10,7 @@ namespace roundel {
 /// black, from the direction of the code's zero counter-clockwise as seen in front of the print.
 using Word = uint32_t;
 constexpr int kCodeSectors = 18;
+constexpr int kCodeDistance = 4;  // sectors in which two words differ at least, at any turns
 constexpr double kCodeInner = 1.45, kCodeOuter = 1.8;  // radii of the ring, outer radii of the roundel
 
 /// The word of a print that is turned by so many sectors against its own zero.

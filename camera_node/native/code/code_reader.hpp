@@ -29,8 +29,9 @@ class CodeTrack {
     void include(const std::vector<float>& codes);
 
     double count_ = 0;  // frames
-    std::vector<float>
-        means_;  // of the codes' log-likelihoods over that of no code; none where that is greater
+    /// Means of the codes' log-likelihoods over that of no code; none where that is greater.
+    std::vector<float> means_;
+    size_t best_ = 0;  // the most probable code
 };
 
 }  // namespace roundel

@@ -28,6 +28,8 @@ class Cholesky {
         }
     }
     bool positive() const { return positive_; }
+    /// Element (i, j) of L, for j <= i.
+    double at(size_t i, size_t j) const { return L_[i][j]; }
     double log_determinant() const {
         double sum = 0;
         for (const double x : per_diagonal_) sum -= 2 * std::log(x);

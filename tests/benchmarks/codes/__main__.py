@@ -78,7 +78,7 @@ class Benchmark:
                 comparison.rows(max(1, self.count // 48)),
             )
         if self._measures("reading"):
-            headings = ("diameter, px", "coded", "plain", "plain, on tiles")
+            headings = ("diameter, px", "coded", "coded, faint", "plain", "plain, on tiles")
             _print("microseconds of a read", headings, reading_times())
         if self._measures("robots"):
             headings = ("robots seen for 0.2 s", "% tracked", "poses of another", "missing")
