@@ -18,10 +18,12 @@ constexpr int kMaxMovingFits = 32;     // of streaks in a frame,
 constexpr int kMaxFailures = 3;        // of which so many may fail; but one, unless one succeeded,
 constexpr double kPoorMisfit = 0.085;  // from this misfit on: 5 % of moving roundels have more, and clutter
 
-constexpr int kOverlap = 64;            // rows that a searched band shares with the one before
-constexpr int kSearchInterval = 16;     // frames in which all of the image is searched once
-constexpr double kMaxPartsShare = 0.5;  // of a frame: beyond it the whole frame is searched
-constexpr double kMinChange = 1 / 8.0;  // of the least contrast: change of a tile's mean
+constexpr int kOverlap = 64;             // rows that a searched band shares with the one before
+constexpr double kExponentChange = 0.1;  // of the logarithm: smaller ones count as none (camera_model.cpp)
+constexpr double kLikelyExponent = 1.6;  // of an unknown camera: the mean of its prior (tone_curve.cpp)
+constexpr int kSearchInterval = 16;      // frames in which all of the image is searched once
+constexpr double kMaxPartsShare = 0.5;   // of a frame: beyond it the whole frame is searched
+constexpr double kMinChange = 1 / 8.0;   // of the least contrast: change of a tile's mean
 // Noise alone spans 8 standard deviations in 10,000 pixels, and 9 in the widest tile of a frame.
 constexpr double kNoiseSpan = 9.5;
 
@@ -59,7 +61,10 @@ FrameResult Detector::detect(const ImageView& image) {
         fit_by_paper(frame);
     } else {
         parts = parts_to_search(frame);
-        candidates = find_candidates(frame, parts);
+        find_candidates(frame, parts, camera_.exponent_in_use(), candidates);
+        // All of the image was searched in the frame before, as that of a linear camera.
+        if (n_frames_ == 2 && !camera_.exponent() && search_share_ >= 1)
+            find_candidates(frame, {{0, 0, image.width, image.height}}, kLikelyExponent, candidates);
         n_postponed_ = fit_seeds(candidates.seeds, frame);
     }
     // 4. Roundels that moved during the exposure.
@@ -138,14 +143,15 @@ static double tile_contrast(double noise, const RoundelLimits& limits) {
     return std::clamp(kNoiseSpan * noise, limits.min_contrast, 255.0);
 }
 
-/// Searches the parts of the image for the chords of rings, and for the streaks of moving ones.
-Detector::Candidates Detector::find_candidates(const FrameState& frame, const std::vector<Box>& parts) {
-    Candidates candidates;
+/// Searches the parts of the image for the chords of rings, and for the streaks of moving ones. `exponent` is
+/// that of the camera's tone curve.
+void Detector::find_candidates(const FrameState& frame, const std::vector<Box>& parts, double exponent,
+                               Candidates& candidates) {
     const bool linear = camera_.exponent_in_use() == 1;
     const double noise = linear ? frame.noise : noise_level(frame.encoded);
     for (const Box& part : parts) {
         const ImageView view = window(frame.encoded, part);
-        chords_.run(view, local_threshold(view, tile_contrast(noise, limits_), 0));
+        chords_.run(view, local_threshold(view, tile_contrast(noise, limits_), 0, {exponent, noise}));
         const float left = float(part.left), top = float(part.top);
         for (Seed seed : chords_.seeds()) {
             seed.x += left;
@@ -158,7 +164,6 @@ Detector::Candidates Detector::find_candidates(const FrameState& frame, const st
             candidates.streaks.push_back(streak);
         }
     }
-    return candidates;
 }
 
 /// Fits the seeds. Returns how many are left if there are more than the fits allowed: the next frame begins
@@ -275,6 +280,9 @@ void Detector::use_camera() {
     if (limits_.linearized_by == camera_.exponent_in_use()) return;
     limits_.linearized_by = camera_.exponent_in_use();
     tracks_.forget_models();
+    if (std::abs(std::log(limits_.linearized_by / searched_with_)) < kExponentChange) return;
+    searched_with_ = limits_.linearized_by;
+    change_mask_.invalidate();  // the next frame is searched with other thresholds
 }
 
 /// Section III-B of the paper: theta follows the mean levels of the roundels.

@@ -70,7 +70,8 @@ class Detector {
     void fit_by_paper(FrameState& frame);
     std::vector<Box> parts_to_search(const FrameState& frame);
     Box next_band(const ImageView& image);
-    Candidates find_candidates(const FrameState& frame, const std::vector<Box>& parts);
+    void find_candidates(const FrameState& frame, const std::vector<Box>& parts, double exponent,
+                         Candidates& candidates);
     int fit_seeds(const std::vector<Seed>& seeds, FrameState& frame);
     void fit_moving_tracked(std::vector<ExpectedRoundel> lost, FrameState& frame) const;
     void fit_moving_streaks(const std::vector<Streak>& streaks, FrameState& frame) const;
@@ -96,10 +97,11 @@ class Detector {
     CameraModel camera_;
     Tracks tracks_;
     ChangeMask change_mask_;
-    double searched_to_ = 0;  // share of the height, of the bands searched in turns
-    double begin_at_ = 0;     // share of the seeds at which the next frame begins
-    int n_postponed_ = 0;     // in the last frame
-    int n_frames_ = 0;        // since all of the image counted as changed
+    double searched_to_ = 0;    // share of the height, of the bands searched in turns
+    double begin_at_ = 0;       // share of the seeds at which the next frame begins
+    double searched_with_ = 1;  // exponent of the tone curve
+    int n_postponed_ = 0;       // in the last frame
+    int n_frames_ = 0;          // since all of the image counted as changed
     mutable std::mutex mutex_;
 };
 

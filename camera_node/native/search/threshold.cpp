@@ -100,6 +100,9 @@ ThresholdMap constant_threshold(uint8_t theta) { return {30, 1, {theta}}; }
 namespace {
 
 constexpr int kLevels = 5;
+// The range of a hundred normal variables in standard deviations (Tippett 1925): about as many pixels of ink
+// and of paper are in a tile and its neighbours.
+constexpr double kExtremes = 5;
 
 /// The darkest and the brightest pixel of each tile, row by row.
 struct TileRange {
@@ -213,11 +216,26 @@ ROUNDEL_CLONES TileRange halve(const TileRange& range) {
     return coarse;
 }
 
-/// Sets the threshold to the mid-range if there is contrast; otherwise the coarser level's value remains.
-ROUNDEL_CLONES void set_thresholds(const uint8_t* low, const uint8_t* high, int n, uint8_t min_contrast,
-                                   uint8_t* theta) {
+/// The least contrast of a threshold, the exponent of the camera's tone curve, and by how much noise widens
+/// the range of a tile and its neighbours.
+struct ThresholdLimits {
+    uint8_t min_contrast;
+    double exponent, noise_range;
+};
+
+/// Sets the threshold half way between the extremes' light if there is contrast; otherwise the coarser
+/// level's value remains. With the exponent e, light is the level to the power e: to second order, the level
+/// half way from a to b is (a + b) / 2 + (e - 1) (b - a)^2 / (4 (a + b)). Noise widens the range b - a
+/// equally at both ends.
+ROUNDEL_CLONES void set_thresholds(const uint8_t* low, const uint8_t* high, int n,
+                                   const ThresholdLimits& limits, uint8_t* theta) {
+    const auto bend = float((limits.exponent - 1) / 4), noise_range = float(limits.noise_range);
+    const uint8_t min_contrast = limits.min_contrast;
     for (int x = 0; x < n; ++x) {
-        const auto middle = uint8_t((low[x] + high[x] + 1) >> 1), contrast = uint8_t(high[x] - low[x]);
+        const auto contrast = uint8_t(high[x] - low[x]);
+        const float beyond = float(contrast) - noise_range, sum = float(low[x] + high[x] + 1);
+        const float difference = beyond > 0 ? beyond : 0;
+        const auto middle = uint8_t(0.5f * sum + bend * difference * difference / sum);
         theta[x] = contrast >= min_contrast ? middle : theta[x];
     }
 }
@@ -228,26 +246,27 @@ ROUNDEL_CLONES void double_row(const uint8_t* from, int n, uint8_t* to) {
     if (n % 2) to[n - 1] = from[n / 2];
 }
 
-std::vector<uint8_t> refine_thresholds(const TileRange& range, uint8_t min_contrast,
+std::vector<uint8_t> refine_thresholds(const TileRange& range, const ThresholdLimits& limits,
                                        const std::vector<uint8_t>& coarser) {
     std::vector<uint8_t> theta(range.low.size());
     const size_t columns = (size_t(range.columns) + 1) / 2;
     for (int y = 0; y < range.rows; ++y) {
         const size_t first = range.at(0, y);
         double_row(&coarser[size_t(y / 2) * columns], range.columns, &theta[first]);
-        set_thresholds(&range.low[first], &range.high[first], range.columns, min_contrast, &theta[first]);
+        set_thresholds(&range.low[first], &range.high[first], range.columns, limits, &theta[first]);
     }
     return theta;
 }
 
 }  // namespace
 
-ThresholdMap local_threshold(const ImageView& image, double min_contrast, uint8_t theta) {
+ThresholdMap local_threshold(const ImageView& image, double min_contrast, uint8_t theta, const Tone& tone) {
     std::vector<TileRange> pyramid{dilate(tile_range(image))};
     while (pyramid.size() < kLevels) pyramid.push_back(halve(pyramid.back()));
     std::vector<uint8_t> thresholds(pyramid.back().low.size(), theta);
     for (auto range = pyramid.rbegin(); range != pyramid.rend(); ++range)
-        thresholds = refine_thresholds(*range, uint8_t(min_contrast), thresholds);
+        thresholds = refine_thresholds(*range, {uint8_t(min_contrast), tone.exponent, kExtremes * tone.noise},
+                                       thresholds);
     return {kShift, pyramid[0].columns, std::move(thresholds)};
 }
 

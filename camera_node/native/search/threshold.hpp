@@ -32,9 +32,15 @@ struct ThresholdMap {
 /// One threshold for a whole image.
 ThresholdMap constant_threshold(uint8_t theta);
 
-/// A threshold that follows local light: the mid-range of each 8 x 8 tile (every second row of it) and of its
-/// neighbours. A tile with less contrast than `min_contrast` uses the tiles of 16, 32, 64 and 128 pixels
-/// around it, and finally `theta`.
-ThresholdMap local_threshold(const ImageView& image, double min_contrast, uint8_t theta);
+/// The exponent of a camera's tone curve, and the standard deviation of the noise, grey levels.
+struct Tone {
+    double exponent = 1, noise = 0;
+};
+
+/// A threshold that follows local light: half way between the extremes of each 8 x 8 tile (every second row
+/// of it) and of its neighbours, in light. A tile with less
+/// contrast than `min_contrast` uses the tiles of 16, 32, 64 and 128 pixels around it, and finally `theta`.
+ThresholdMap local_threshold(const ImageView& image, double min_contrast, uint8_t theta,
+                             const Tone& tone = {});
 
 }  // namespace roundel
