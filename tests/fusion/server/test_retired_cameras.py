@@ -54,13 +54,14 @@ def test_single_late_frames_are_counted_and_not_logged(caplog: pytest.LogCapture
     """A busy machine delays one frame a minute for days: that is no state of the camera."""
     statistics, second = ServerStatistics(), 10**9
     caplog.set_level(logging.INFO, "fusion")
-    for k in range(1, 1 + 10 * round(2 * ON_TIME_S)):
+    last = 10 * round(2 * ON_TIME_S)
+    for k in range(1, 1 + last):
         statistics.count_arrival("cam0", k * second, k * second)
         if k % round(2 * ON_TIME_S) == 0:
             statistics.note_late("cam0", 390.0, 150.0)
         else:
             statistics.note_on_time("cam0")
-    assert statistics.report(k * second, PipelineStatus()).cameras["cam0"].late == 10
+    assert statistics.report(last * second, PipelineStatus()).cameras["cam0"].late == 10
     assert [record.getMessage() for record in caplog.records] == ["camera cam0 appeared"]
 
 
