@@ -105,6 +105,7 @@ class Queue:
         load: robots and cameras.
         seconds: of the load.
         pace: factor of the measured processor times, to simulate a faster or a slower machine.
+        rate_hz: of frame sets; that of the cameras unless given.
         use: is called with the time of a publication, and its poses, after the first `START_S` seconds.
     """
 
@@ -113,6 +114,7 @@ class Queue:
         load: Load,
         seconds: float,
         pace: float = 1.0,
+        rate_hz: float | None = None,
         use: Callable[[int, Sequence[RobotPose]], None] | None = None,
     ) -> None:
         self.load, self.pace, self._use = load, pace, use
@@ -120,9 +122,10 @@ class Queue:
         self._ingest = Ingest(self._keys, self._statistics)
         self.tracker = Tracker(load.rig, load.bodies)
         self.tracker.monitors.rig.executor = JudgeProcess()
-        self.synchronizer = FrameSynchronizer(round(1e9 / load.hz))
+        rate_hz = rate_hz or load.hz
+        self.synchronizer = FrameSynchronizer(round(1e9 / rate_hz))
         self.free_ns = self.busy_ns = self._first_ns = self._collected_ns = 0
-        room = math.ceil((seconds + 1) * load.hz)
+        room = math.ceil((seconds + 1) * rate_hz)
         self.latencies_ms, self.tracked = Series(room), Series(room)
         self._done_ns = Series(room)  # processor time at the end of each frame set
         self._warm = False
