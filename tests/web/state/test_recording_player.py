@@ -211,7 +211,7 @@ def test_a_part_is_saved_as_a_recording(recording: Path):
 
 
 @pytest.mark.parametrize(
-    ("from_s", "to_s", "says"), [(3.0, 3.0, "empty"), (-1.0, 3.0, "empty"), (30.0, 40.0, "no message")]
+    ("from_s", "to_s", "says"), [(3.0, 3.0, "empty"), (-1.0, 3.0, "begins at 0"), (30.0, 40.0, "no message")]
 )
 def test_an_empty_part_is_refused(recording: Path, from_s: float, to_s: float, says: str):
     """And nothing is written."""
