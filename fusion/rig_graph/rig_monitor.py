@@ -148,7 +148,7 @@ class RigMonitor:
         self._given_ns = self._measured_ns = 0  # of the last keyframes of the last job, and of the walk
         self._clocks: list[int] = []  # the cameras of the last verdicts in a row about a clock
         self._refinement: Refinement | None = None  # of the cameras in use; None before their first window
-        self._was_doubtful = False
+        self._was_doubtful, self._doubtful_ns = False, -CHECK_NS  # in the last frame set; when it was last
         self._moments: deque[tuple[FrameSet, Snapshot]] = deque()
         self._moved: set[str] = set()  # the excluded cameras that showed most markers elsewhere
         self._given = cameras, markers  # to the job
@@ -254,16 +254,18 @@ class RigMonitor:
             frame_set: with the frames of excluded cameras.
             now: the robots after the update with this frame set.
             fit: of the robots to the frame set. When it begins to be doubtful, something changed: the keyframes before
-                do not show what is now. If one camera alone is displaced several times, it moved: the others show the
-                robots where they are predicted.
+                do not show what is now. Later, single frame sets may be, while robots follow the change in turns. If
+                one camera alone is displaced several times, it moved: the others show the robots where they are
+                predicted.
             recalibrates: False for the server of a zone that takes the rig from another.
         """
         self.is_settled = False
         if (excluded := self._exclude_displaced(fit.displaced)) is not None:
             return (excluded,)
         is_doubtful = fit.is_doubtful or bool(fit.displaced)
-        if is_doubtful and not self._was_doubtful:
+        if is_doubtful and now.t_ns > self._doubtful_ns + CHECK_NS:
             self._forget()
+        self._doubtful_ns = now.t_ns if is_doubtful else self._doubtful_ns
         self._was_doubtful = is_doubtful
         self._remember_moment(frame_set, now)
         if self._keyframes.add(frame_set, now):
