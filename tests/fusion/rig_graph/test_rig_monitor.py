@@ -14,9 +14,9 @@ from scipy.stats import chi2
 
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.corrections import ExtrinsicsCorrection
-from fusion.model.frames import CalibratedFrame
-from fusion.model.states import POSITION, Snapshot
-from fusion.rig_graph.hypotheses import CAUSES, RIVAL, Verdict
+from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.states import POSITION, FrameSetFit, Snapshot
+from fusion.rig_graph.hypotheses import CAUSES, CONFIRMED, RIVAL, Verdict
 from fusion.rig_graph.keyframes import Keyframes
 from fusion.rig_graph.rig_monitor import WINDOWS, JudgeProcess, watch
 from fusion.server.frame_synchronizer import FrameSynchronizer
@@ -329,6 +329,20 @@ def test_markers_that_several_labelings_explain_are_not_elsewhere():
     outcome = run(Case(kind="wand 1 % short", cameras=3, seed=0, robots=1, speed_m_s=0.0))
     assert not [line for line in outcome.lines if "was moved" in line]
     assert max(outcome.ratios[1:]) < 2.0
+
+
+def test_a_camera_that_shows_all_elsewhere_is_excluded_unless_several_contradict_each_other():
+    """By then the one at fault may predict the robots."""
+    tracker = Tracker(moved(0.0, 0.0)[0].cameras, ROBOTS)
+    monitor, states = tracker.monitors.rig, tracker.table.states
+    now, fit = Snapshot(START_NS, states, np.zeros(len(states), bool)), FrameSetFit(False, {1: CONFIRMED})
+    monitor.contradicting = tracker.cameras.names
+    assert monitor.check(FrameSet(START_NS, ()), now, fit, True) == ()
+    monitor.contradicting = ()
+    corrections = monitor.check(FrameSet(START_NS, ()), now, fit, True)
+    assert [(c.name, c.camera) for c in corrections if isinstance(c, ExtrinsicsCorrection)] == [
+        ("cam1", None)
+    ]
 
 
 @pytest.mark.ci
