@@ -7,8 +7,7 @@ from typing import Literal
 import msgspec
 
 from camera_node.commands.adjust import save_picture
-from camera_node.foundation.config import require_name
-from camera_node.foundation.errors import ConfigError
+from camera_node.foundation.config import require_arguments, require_name
 from camera_node.foundation.terminal import say
 from camera_node.protocol.camera_requests import change_camera, request_cameras, request_snapshot
 from camera_node.protocol.registration import CameraChange, RegisteredCamera
@@ -16,7 +15,6 @@ from camera_node.protocol.requests import RequestSource
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 
 USES = {"list": "", "rename": "OLD NEW", "forget": "NAME", "why": "NAME [PICTURE.jpg]"}
-N_ARGUMENTS = {"list": (0,), "rename": (2,), "forget": (1,), "why": (1, 2)}
 
 
 def cameras(
@@ -35,10 +33,7 @@ def cameras(
     """
     if action == "rename" and len(arguments) == 2:
         require_name(arguments[1], "a camera")
-    if len(arguments) not in N_ARGUMENTS[action]:
-        raise ConfigError(
-            f"words after {action}: {len(arguments)}; use roundel cameras {action} {USES[action]}".rstrip()
-        )
+    require_arguments("cameras", action, arguments, USES[action])
     with connection.open() as session:
         if action == "why":
             name = require_name(arguments[0], "a camera")

@@ -11,7 +11,7 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,6 +32,7 @@ KINDS = {  # what a file describes, by a key that no file of another kind has at
     "listen": "a server (arena.yaml)",
 }
 MAX_BYTES = 1 << 20  # of a file; 64 cameras with covariances take a tenth of it
+MAX_ARGUMENTS = 1000  # of an action that takes many
 MAX_DEPTH = 32  # nested lists and mappings; no file of this project has more than 6
 MAX_VALUES = 100_000  # about 1 kB of memory each while a file is read
 # libyaml reads ahead of its events by at most 1024 characters of a line, and refuses 1000 levels: that many brackets in
@@ -74,6 +75,22 @@ def require_name(text: str, what: str) -> str:
     if not is_name(text):
         raise ConfigError(f"'{printable(text, 80)}' can't name {what}; {NAME_RULE}")
     return text
+
+
+def require_port(port: int, usual: int) -> None:
+    """Raise ConfigError unless --port has a port of TCP or UDP; `usual` is an example."""
+    if not 0 <= port < 1 << 16:
+        raise ConfigError(f"--port {port} is not a port; give one from 1 to 65535, such as {usual}")
+
+
+def require_arguments(command: str, action: str, arguments: Sequence[str], use: str) -> None:
+    """Raise ConfigError unless an action has as many words as its use, such as `OLD NEW`, `NAME [FILE]`, `FILE...`."""
+    words = use.split()
+    least = sum(not word.startswith("[") for word in words)
+    most = MAX_ARGUMENTS if use.endswith("...") else len(words)
+    if not least <= len(arguments) <= most:
+        count = f"words after {action}: {len(arguments)}"
+        raise ConfigError(f"{count}; use roundel {command} {action} {use}".rstrip())
 
 
 def load_yaml(path: Path, kind: type[T]) -> T:

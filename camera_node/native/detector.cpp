@@ -18,12 +18,10 @@ constexpr int kMaxMovingFits = 32;     // of streaks in a frame,
 constexpr int kMaxFailures = 3;        // of which so many may fail; but one, unless one succeeded,
 constexpr double kPoorMisfit = 0.085;  // from this misfit on: 5 % of moving roundels have more, and clutter
 
-constexpr int kOverlap = 64;             // rows that a searched band shares with the one before
-constexpr double kExponentChange = 0.1;  // of the logarithm: smaller ones count as none (camera_model.cpp)
-constexpr double kLikelyExponent = 1.6;  // of an unknown camera: the mean of its prior (tone_curve.cpp)
-constexpr int kSearchInterval = 16;      // frames in which all of the image is searched once
-constexpr double kMaxPartsShare = 0.5;   // of a frame: beyond it the whole frame is searched
-constexpr double kMinChange = 1 / 8.0;   // of the least contrast: change of a tile's mean
+constexpr int kOverlap = 64;            // rows that a searched band shares with the one before
+constexpr int kSearchInterval = 16;     // frames in which all of the image is searched once
+constexpr double kMaxPartsShare = 0.5;  // of a frame: beyond it the whole frame is searched
+constexpr double kMinChange = 1 / 8.0;  // of the least contrast: change of a tile's mean
 // Noise alone spans 8 standard deviations in 10,000 pixels, and 9 in the widest tile of a frame.
 constexpr double kNoiseSpan = 9.5;
 
@@ -64,7 +62,7 @@ FrameResult Detector::detect(const ImageView& image) {
         find_candidates(frame, parts, camera_.exponent_in_use(), candidates);
         // All of the image was searched in the frame before, as that of a linear camera.
         if (n_frames_ == 2 && !camera_.exponent() && search_share_ >= 1)
-            find_candidates(frame, {{0, 0, image.width, image.height}}, kLikelyExponent, candidates);
+            find_candidates(frame, {{0, 0, image.width, image.height}}, kPriorExponent, candidates);
         n_postponed_ = fit_seeds(candidates.seeds, frame);
     }
     // 4. Roundels that moved during the exposure.
@@ -280,7 +278,7 @@ void Detector::use_camera() {
     if (limits_.linearized_by == camera_.exponent_in_use()) return;
     limits_.linearized_by = camera_.exponent_in_use();
     tracks_.forget_models();
-    if (std::abs(std::log(limits_.linearized_by / searched_with_)) < kExponentChange) return;
+    if (std::abs(std::log(limits_.linearized_by / searched_with_)) < kMinTone) return;
     searched_with_ = limits_.linearized_by;
     change_mask_.invalidate();  // the next frame is searched with other thresholds
 }

@@ -8,7 +8,8 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from camera_node.foundation.errors import AddressError, ConfigError, RoundelError
+from camera_node.foundation.config import require_port
+from camera_node.foundation.errors import AddressError, RoundelError
 from camera_node.foundation.extras import require
 from camera_node.foundation.rate_limit import RateLimit
 from camera_node.protocol.messages import MessageError, Preview, decode
@@ -39,8 +40,7 @@ def serving(host: str, port: int, name: str) -> Iterator[tuple[FoxgloveChannels,
         ConfigError: foxglove-sdk is missing.
     """
     foxglove = require("foxglove", "foxglove", "roundel foxglove")
-    if not 0 <= port < 1 << 16:
-        raise ConfigError(f"--port {port} is not a port; give one from 1 to 65535, such as 8765")
+    require_port(port, usual=8765)
     context = foxglove.Context()
     try:
         server = foxglove.start_server(name=name, host=host, port=port, context=context)

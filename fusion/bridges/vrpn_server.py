@@ -15,7 +15,8 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from camera_node.foundation.errors import AddressError, ConfigError
+from camera_node.foundation.config import require_port
+from camera_node.foundation.errors import AddressError
 from fusion.bridges import vrpn_messages as vrpn
 from fusion.bridges.pose_queue import WAIT_S, PoseQueue
 from fusion.protocol.pose_messages import RobotPose
@@ -301,8 +302,7 @@ def pack(parts: list[bytes], size: int) -> list[bytes]:
 
 def _listen(host: str, port: int) -> tuple[socket.socket, socket.socket]:
     """Sockets of TCP and UDP on the same port."""
-    if not 0 <= port < 1 << 16:
-        raise ConfigError(f"--port {port} is not a port; give one from 1 to 65535, such as 3883")
+    require_port(port, usual=3883)
     listener, datagrams = socket.socket(), socket.socket(type=socket.SOCK_DGRAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

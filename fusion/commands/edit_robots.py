@@ -7,6 +7,7 @@ from typing import Literal
 
 import zenoh
 
+from camera_node.foundation.config import require_arguments
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from camera_node.protocol.requests import RequestSource
@@ -23,14 +24,6 @@ USES = {
     "pivot": "NAME X Y Z",
     "turn": "NAME DEGREES",
     "save": "FILE",
-}
-COUNTS = {
-    "list": (0, 0),
-    "rename": (2, 2),
-    "remove": (1, 1000),
-    "pivot": (4, 4),
-    "turn": (2, 2),
-    "save": (1, 1),
 }
 
 
@@ -52,11 +45,7 @@ def robots(
         force: save overwrites the file.
         connection: the arena's server.
     """
-    counts = COUNTS[action]
-    if not counts[0] <= len(arguments) <= counts[1]:
-        raise ConfigError(
-            f"words after {action}: {len(arguments)}; use roundel robots {action} {USES[action]}".rstrip()
-        )
+    require_arguments("robots", action, arguments, USES[action])
     if action == "save" and Path(arguments[0]).exists() and not force:
         raise ConfigError(f"{arguments[0]} exists; add --force to overwrite it, or name another file")
     with connection.open() as session:

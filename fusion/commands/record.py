@@ -9,9 +9,8 @@ from camera_node.foundation.service import stopped_by_signals
 from camera_node.foundation.terminal import say
 from camera_node.protocol.server_connection import LOCAL_SERVER, ConnectionOptions
 from fusion.recordings.arena_recording import NO_ROBOTS, ArenaRecorder
+from fusion.recordings.recording_files import SUFFIX
 from fusion.recordings.rotation import RotatingWriter, Rotation
-
-SUFFIX = ".mcap"  # of the files that `roundel recordings list` and the page show
 
 
 def record(

@@ -4,6 +4,7 @@
 from pathlib import Path
 from typing import Literal
 
+from camera_node.foundation.config import require_arguments
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import say
 from fusion.recordings.recording_files import (
@@ -14,7 +15,6 @@ from fusion.recordings.recording_files import (
 )
 
 USES = {"list": "[FOLDER]", "rename": "FILE NAME", "remove": "FILE..."}
-COUNTS = {"list": (0, 1), "rename": (2, 2), "remove": (1, 1000)}
 
 
 def recordings(
@@ -28,11 +28,7 @@ def recordings(
         action: list [FOLDER]; rename FILE NAME, in the same folder; remove FILE... deletes them for good.
         arguments: as the action needs them.
     """
-    counts = COUNTS[action]
-    if not counts[0] <= len(arguments) <= counts[1]:
-        raise ConfigError(
-            f"words after {action}: {len(arguments)}; use roundel recordings {action} {USES[action]}"
-        )
+    require_arguments("recordings", action, arguments, USES[action])
     paths = [Path(word) for word in arguments]
     if action == "rename":
         say(f"{paths[0]} is called {rename_recording(paths[0], arguments[1])} from now on")

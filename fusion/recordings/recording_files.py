@@ -16,6 +16,7 @@ from camera_node.foundation.terminal import say
 from fusion.recordings.context import Context
 
 KEY = re.compile(r".+?/(camera|robot)/([^/]+)/(?:detections|pose)")
+SUFFIX = ".mcap"
 MAX_FILES = 200  # of one folder, the newest
 
 
@@ -57,7 +58,7 @@ def summarize_recording(path: Path) -> RecordingSummary:
 def list_recordings(folder: Path) -> list[RecordingSummary]:
     """The recordings (*.mcap) of a folder, the newest first."""
     times_ns: dict[Path, int] = {}
-    for path in folder.glob("*.mcap"):
+    for path in folder.glob(f"*{SUFFIX}"):
         with suppress(OSError):  # it was removed or renamed just now
             times_ns[path] = path.stat().st_mtime_ns
     found = []
@@ -65,9 +66,6 @@ def list_recordings(folder: Path) -> list[RecordingSummary]:
         with suppress(OSError):
             found.append(summarize_recording(path))
     return found
-
-
-SUFFIX = ".mcap"
 
 
 def recording_path(folder: Path, name: str) -> Path:

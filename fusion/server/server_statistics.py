@@ -172,12 +172,13 @@ class ServerStatistics:
         if not camera.late_since_ns:
             camera.late_since_ns, camera.late_before = camera.last_ns, camera.late
         camera.late, camera.late_ns = camera.late + 1, camera.last_ns
-        if camera.late - camera.late_before == LOGGED_LATE and age_ms > limit_ms:
-            late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
-            log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
-        elif camera.late - camera.late_before == LOGGED_LATE:
-            late = "%s: a frame came after later ones, %.0f ms old; such frames are dropped"
-            log.warning(late, name, age_ms, extra=self._about(name))
+        if camera.late - camera.late_before == LOGGED_LATE:
+            if age_ms > limit_ms:
+                late = "%s is %.0f ms late (limit %.0f ms); its late frames are dropped"
+                log.warning(late, name, age_ms, limit_ms, extra=self._about(name))
+            else:
+                late = "%s: a frame came after later ones, %.0f ms old; such frames are dropped"
+                log.warning(late, name, age_ms, extra=self._about(name))
         with self._lock:
             camera.skipped[LATE] += 1
 

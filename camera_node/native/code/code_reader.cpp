@@ -34,7 +34,7 @@ constexpr float kImpossible = -1e9f;        // a log-likelihood
 constexpr double kInterpolation = 1 / 6.0;  // variance that bilinear interpolation adds to blur, px^2
 
 constexpr int kMostSamples = kFinest * kCodeSectors;
-constexpr int kTurns = 48;  // in a sector: samples begin at some of them, and its middle is one
+constexpr int kTurns = 48;  // in a sector, so that samples of 4, 8, 12 and 16 a sector begin at turns
 constexpr Bits kLane{0, 1, 2, 3, 4, 5, 6, 7};
 
 constexpr size_t whole_lanes(size_t count) { return (count + kLanes - 1) / kLanes * kLanes; }

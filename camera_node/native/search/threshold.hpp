@@ -38,8 +38,8 @@ struct Tone {
 };
 
 /// A threshold that follows local light: half way between the extremes of each 8 x 8 tile (every second row
-/// of it) and of its neighbours, in light. A tile with less
-/// contrast than `min_contrast` uses the tiles of 16, 32, 64 and 128 pixels around it, and finally `theta`.
+/// of it) and of its neighbours, in light. A tile with less contrast than `min_contrast` uses the tiles of
+/// 16, 32, 64 and 128 pixels around it, and finally `theta`.
 ThresholdMap local_threshold(const ImageView& image, double min_contrast, uint8_t theta,
                              const Tone& tone = {});
 

@@ -12,8 +12,6 @@ constexpr double kMaxLogExponent = 0.9;  // in use, 2.5: steeper ones enlarge wh
 constexpr double kSteepest = 3;          // measured, 20: powers of levels remain numbers
 constexpr int kSteps = 6;                // of Newton's method
 constexpr double kSecondOrder = 0.15;    // error of a measured curvature, over its square
-// Logarithm of an exponent: smaller ones count as linear, and are measured exactly to a hundredth.
-constexpr double kMinTone = 0.1;
 constexpr double kMinLeft = 0.15;    // of a curvature: less is the error of the print, or learned as a spread
 constexpr double kMinChange = 0.02;  // of the logarithm
 constexpr double kMaxSigma = 0.15;   // of the logarithm, from which it is used

@@ -17,6 +17,9 @@
 
 namespace roundel {
 
+/// Logarithm of an exponent: smaller ones count as linear, and are measured exactly to a hundredth.
+constexpr double kMinTone = 0.1;
+
 /// What is known of a camera, its light and its prints, with its uncertainty (detector_model.md, sections 3
 /// to 4): the tone curve, the residuals that processing leaves at edges and their correlation, the light that
 /// falls off, the ratios of the prints and how much they bend. A frame's fits teach all of it, and the next

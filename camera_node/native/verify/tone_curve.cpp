@@ -13,7 +13,6 @@ namespace {
 constexpr int kSteps = 3;
 constexpr double kModelSigma = 0.05;    // of a curvature: what the family leaves
 constexpr double kHuber = 1.5;          // standard deviations
-constexpr double kExponent = 1.6;       // mean of the prior
 constexpr double kExponentSigma = 0.8;  // standard deviation of the prior
 constexpr double kShoulderSigma = 4;
 
@@ -54,7 +53,7 @@ void ToneCurve::learn(const std::vector<ToneSample>& samples) {
             regression_.include(by, off + by[0] * exponent_ + by[1] * shoulder_, weight);
         }
         const auto estimate =
-            regression_.solve({1 / square(kExponentSigma), 1 / square(kShoulderSigma)}, {kExponent, 0});
+            regression_.solve({1 / square(kExponentSigma), 1 / square(kShoulderSigma)}, {kPriorExponent, 0});
         if (!estimate) return;
         exponent_ = estimate->mean[0];
         shoulder_ = estimate->mean[1];

@@ -6,6 +6,9 @@
 
 namespace roundel {
 
+/// The mean of the prior of an unknown camera's exponent.
+constexpr double kPriorExponent = 1.6;
+
 /// A share of the scale that a camera shows, and what the tone curve's unknowns multiply there.
 struct EncodedLevel {
     explicit EncodedLevel(double share);
