@@ -72,9 +72,7 @@ double noise_level(const ImageView& image) {
 
 double noise_density(const ImageView& image) {
     constexpr double kLeast = 0.484;  // of the mean: a twentieth of chi-square with 15 degrees of freedom
-    const double density = in_flat_patches<4 * kSquare, 4 * kSquare>(image, density_of) / kLeast;
-    const double in_blocks = kTile * noise_level(image);
-    return std::clamp(density, 1.0, in_blocks * in_blocks);
+    return std::max(1.0, in_flat_patches<4 * kSquare, 4 * kSquare>(image, density_of) / kLeast);
 }
 
 namespace {

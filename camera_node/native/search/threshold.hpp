@@ -14,8 +14,7 @@ double noise_level(const ImageView& image);
 
 /// Spectral density of the noise at low frequencies in squared grey levels, 1 at least, estimated like its
 /// level: the variance of a mean of n pixels is this over n, however processing correlates them. That of
-/// independent noise is its variance. In a picture full of detail the density is that of noise which is
-/// equal in each block of 8 x 8 pixels of a compression.
+/// independent noise is its variance. In a picture full of detail it contains that of the detail.
 double noise_density(const ImageView& image);
 
 /// A threshold for each square tile of an image. A pixel is dark if it is below its tile's threshold.

@@ -218,7 +218,10 @@ static double ring_energy(const ImageView& image, const RoundelFit& fit) {
 
 std::optional<Refusal> refusal_of_new(const ImageView& image, const RoundelFit& fit, double density) {
     const double places = double(image.width) * image.height;
-    if (ring_energy(image, fit) < 2 * std::log(places / kFalseAlarms) * density) return Refusal::kContrast;
+    // Noise of these residuals that is equal in each block of a compression has the greatest density.
+    const double greatest = square(kTile * std::max(1.0, fit.edge_residual));
+    const double least_energy = 2 * std::log(places / kFalseAlarms) * std::min(density, greatest);
+    if (ring_energy(image, fit) < least_energy) return Refusal::kContrast;
     return has_black_ink(fit) ? std::nullopt : std::optional(Refusal::kPaleInk);
 }
 

@@ -28,8 +28,9 @@ enum class Refusal {
 };
 
 /// The test that a fit which passes all others fails as a new roundel, if any: noise of this `density`
-/// (`noise_density`) makes rings of little energy somewhere in a picture, in which it explains all residuals,
-/// and a thin ring of pale ink looks like a thinner, black one.
+/// (`noise_density`), or of less where a ring's own residuals show less, makes rings of little energy
+/// somewhere in a picture, in which it explains all residuals, and a thin ring of pale ink looks like a
+/// thinner, black one.
 std::optional<Refusal> refusal_of_new(const ImageView& image, const RoundelFit& fit, double density);
 
 /// The limit that a fit exceeds, if any.
