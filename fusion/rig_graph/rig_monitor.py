@@ -12,24 +12,18 @@ look wrong.
 """
 
 import logging
-import math
-import os
-import signal
-import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, Future
+from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context, parent_process
-from typing import Any, ParamSpec, TypeVar
 
 import msgspec
 import numpy as np
 from scipy.special import chdtri
 
 from calib.rig.camera import Camera
-from calib.rig.camera_errors import ERRORS, USUAL_PX, with_errors
+from calib.rig.camera_errors import USUAL_PX, with_errors
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose
 from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
@@ -37,7 +31,7 @@ from fusion.model.frames import FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import FrameSetFit, Snapshot
 from fusion.protocol.pose_messages import Contradiction
-from fusion.rig_graph.clock_walk import ClockWalk, Departure, other_offsets
+from fusion.rig_graph.clock_walk import ClockWalk, Departure
 from fusion.rig_graph.hypotheses import (
     CAUSES,
     CONFIRMED,
@@ -49,36 +43,32 @@ from fusion.rig_graph.hypotheses import (
     Hypothesis,
     Verdict,
     Window,
-    equations_by,
     fit,
-    has_changed,
-    judge,
     retract,
-    several_markers,
 )
-from fusion.rig_graph.keyframes import GATES_PX, N_MEAN, Keyframe, Keyframes, Moments, window_of
+from fusion.rig_graph.judge_process import done
+from fusion.rig_graph.judgements import (
+    WINDOWS,
+    Judgement,
+    Measured,
+    OtherClock,
+    blames_one_of_three,
+    confirm,
+    judge_latest,
+    seeing,
+    watch,
+)
+from fusion.rig_graph.keyframes import GATES_PX, Keyframes
 from fusion.rig_graph.refinement import Refinement
-from fusion.rig_graph.robot_shapes import RobotShapes, Shape
+from fusion.rig_graph.robot_shapes import RobotShapes
 
 log = logging.getLogger("fusion")
-P = ParamSpec("P")
-T = TypeVar("T")
-Equations = tuple[int, Array, Array]  # Unix time in ns, and H (8 C, 8 C) and y (8 C,) of `ClockWalk.update`
-NICENESS = 10  # of the process that judges: poses and detections come first
-# Keyframes that are judged: the more, the better they determine a camera; the fewer, the sooner all of them are new.
-WINDOWS = 24, 12, 6
-CHECK_NS, SUSPICIOUS_NS = (
-    500_000_000,
-    200_000_000,
-)  # between two checks: usually, and while cameras contradict
+CHECK_NS = 500_000_000  # between two checks
+SUSPICIOUS_NS = 200_000_000  # the same, while cameras contradict each other
 # Of the time, while nothing changes: judgements, and comparisons of the clocks between them. Both are measured in whole
 # frame sets, so that they take less of a core: together 8 to 11 %, of 4 and of 8 cameras.
 USUAL_SHARE, WATCH_SHARE = 0.06, 0.2
 GREW = 1.5  # ratio of what another offset of a clock explains, now and at the last judgement, to judge again
-CHANGED = 2.0  # ratio of the mean robust costs in both halves of a window in which something changed
-USUAL = (
-    0.2  # mean robust cost that shows nothing: twice that of Gaussian noise, E[log(1 + chi2_2 / CAUCHY^2)]
-)
 MAX_SIGMA_PX = 0.3  # of an accepted pose, at the markers that show it
 MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be far off either
 # Of that factor in a window that contradicts nothing: it shows a part of the arena; one in which all cameras take part
@@ -86,33 +76,6 @@ MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be
 FALL, AGREED_FALL = 0.5**0.125, 0.5
 REMEMBERED_NS = 4_000_000_000  # moments; a camera is judged within three seconds
 MAX_KNOWN = 4  # poses of a camera, to which it may return
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """What the keyframes of a window show that were not measured before.
-
-    Attributes:
-        errors: of the cameras, by all of them.
-        clocks: the same by at most six successive keyframes each, because clocks drift.
-        shapes: by row of the robots.
-    """
-
-    errors: Equations
-    clocks: tuple[Equations, ...]
-    shapes: dict[int, Shape]
-
-
-@dataclass(frozen=True, slots=True)
-class OtherClock:
-    """By how much less keyframes cost if one clock has another offset; and these offsets, s, either way, by camera: of
-    the best and of all that explain as much but for chance, as both of two cameras do."""
-
-    gain: float
-    offsets_s: dict[int, float]
-
-
-Judgement = tuple[Window, Verdict, Measured | None]
 
 
 class RigMonitor:
@@ -294,7 +257,7 @@ class RigMonitor:
             self._pause_ns = round((now_ns - self._checked_ns) / USUAL_SHARE)
             if judged is None:
                 self._is_contradicted = True
-            elif self._is_confirmed or self._moved or not _blames_one_of_three(*judged[:2]):
+            elif self._is_confirmed or self._moved or not blames_one_of_three(*judged[:2]):
                 return self._act(*judged, recalibrates)
             else:  # moments are several MB, which no other judgement needs
                 self._is_confirmed = True
@@ -348,7 +311,7 @@ class RigMonitor:
         return ExtrinsicsCorrection(name, None)
 
     def _start(self, job: Callable[[], Judgement | OtherClock | None]) -> None:
-        self._job = _done(job) if self.executor is None else self.executor.submit(job)
+        self._job = done(job) if self.executor is None else self.executor.submit(job)
 
     def _act(
         self, window: Window, verdict: Verdict, measured: Measured | None, recalibrates: bool
@@ -413,8 +376,8 @@ class RigMonitor:
         """The cameras that are at fault, or contradict each other: of three that see robots no single one, unless it is
         known why; all, by errors that are larger than stated, only if they are stated; all, if the rig has another
         size than the robots."""
-        if verdict.cause is None and len(verdict.cameras) == 1 and len(_seeing(window)) <= MIN_FOR_PAIRS:
-            return tuple(_seeing(window))
+        if verdict.cause is None and len(verdict.cameras) == 1 and len(seeing(window)) <= MIN_FOR_PAIRS:
+            return tuple(seeing(window))
         if verdict.is_of_size:
             return window.names
         if verdict.fit.hypothesis.cause == "shape":  # which is corrected once several windows agree on it
@@ -426,7 +389,7 @@ class RigMonitor:
     def _scale_claims(self, window: Window, verdict: Verdict, names: tuple[str, ...]) -> None:
         """Let claims count the errors of the rig as large as the window shows them."""
         self._doubted |= set(names if names or not verdict.is_of_rig else window.names)
-        fall = AGREED_FALL if self._doubted <= set(_seeing(window)) else FALL
+        fall = AGREED_FALL if self._doubted <= set(seeing(window)) else FALL
         scales = next_scales(self._scale, self._cameras.error_scale, verdict, self._n_undecided > 1, fall)
         self._scale, claimed = scales
         if self._scale == claimed:
@@ -445,7 +408,7 @@ class RigMonitor:
 
     def _returned(self, window: Window) -> tuple[ExtrinsicsCorrection, ...]:
         """The excluded cameras that agree with the others, as they were: nothing is at fault in the window."""
-        names = [name for name in _seeing(window) if name in self.excluded]
+        names = [name for name in seeing(window) if name in self.excluded]
         for name in names:
             self._use(name)
         return tuple(ExtrinsicsCorrection(name, self._cameras[name], has_returned=True) for name in names)
@@ -588,183 +551,6 @@ class RigMonitor:
         self._note_undecided(())
 
 
-class RecordedJudgements(Executor):
-    """Runs a judgement when a recorded server took it: that depends on how busy its machine was."""
-
-    def __init__(self) -> None:
-        self._allowed = 0
-        self._release: Callable[[], None] | None = None  # the judgement that waits
-
-    def submit(self, job: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> "Future[T]":
-        """A future that `allow` makes done."""
-        future: Future[T] = Future()
-        self._release = partial(_run, future, partial(job, *args, **kwargs))
-        self.allow(self._allowed)
-        return future
-
-    def allow(self, n: int) -> None:
-        """From now on `n` judgements may be taken."""
-        self._allowed = n
-        if n > 0 and self._release is not None:
-            release, self._release = self._release, None
-            self._allowed -= 1
-            release()
-
-
-def _done(job: Callable[[], T]) -> "Future[T]":
-    """The result of a job that runs at once."""
-    future: Future[T] = Future()
-    _run(future, job)
-    return future
-
-
-def _run(future: "Future[T]", job: Callable[[], T]) -> None:
-    try:
-        future.set_result(job())
-    except Exception as error:  # as of a job elsewhere
-        future.set_exception(error)
-
-
-def judge_latest(
-    keyframes: Sequence[Keyframe],
-    cameras: CameraArray,
-    markers: MarkerTable,
-    shapes: RobotShapes,
-    since_ns: int,
-    moved: Sequence[str],
-) -> Judgement | None:
-    """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
-    errors of cameras and the shapes of robots is measured."""
-    for n in WINDOWS:
-        if n <= len(keyframes):
-            window, starts = window_of(keyframes[-n:], cameras, markers)
-            verdict = judge(window, starts, [cameras.index[name] for name in moved])
-            newest = np.arange(n) >= n - min(WINDOWS)
-            is_constant = newest.all() or not has_changed(window, verdict.fit, newest)
-            if is_constant and verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
-                return window, verdict, _measure(window, verdict, keyframes[-n:], shapes, since_ns)
-    return None
-
-
-def watch(keyframes: Sequence[Keyframe], cameras: CameraArray, markers: MarkerTable) -> OtherClock:
-    """The clocks of which another offset explains keyframes best: velocities of robots explain it to a frame set, and a
-    judgement takes ten times as long."""
-    window, _ = window_of(keyframes, cameras, markers, may_have_moved=False)
-    none = fit(window, Hypothesis.of(None, (), len(window.names)), max_iterations=0)
-    gains, offsets = other_offsets(window.covariance(1.0), *none.equations)
-    likely = np.flatnonzero(gains > gains.max() - chdtri(1, RIVAL))
-    return OtherClock(float(gains.max()), {int(k): abs(float(offsets[k])) for k in likely})
-
-
-def _blames_one_of_three(window: Window, verdict: Verdict) -> bool:
-    return verdict.cause == "pose" and len(_seeing(window)) <= MIN_FOR_PAIRS
-
-
-def confirm(
-    judged: Judgement,
-    cameras: CameraArray,
-    markers: MarkerTable,
-    moments: Sequence[tuple[FrameSet, Snapshot]],
-) -> Judgement:
-    """The judgement that one of three cameras is at fault if `moments` show that it moved; else an undecided one."""
-    window, verdict, measured = judged
-    if moments and _moved_alone(Moments(*zip(*moments, strict=True)), (cameras, markers), window, verdict):
-        return judged
-    undecided = replace(verdict, cause=None, cameras=tuple(np.unique(window.camera).tolist()))
-    return window, undecided, measured
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Explained:
-    """A frame set by two poses of a camera: the robots by the new one, and how much more that one explains."""
-
-    keyframe: Keyframe
-    moved: Fit
-    gain: float
-
-
-def _moved_alone(
-    moments: Moments, scene: tuple[CameraArray, MarkerTable], window: Window, verdict: Verdict
-) -> bool:
-    """Whether one of three cameras moved from one moment to the next, while the robots were where they are predicted.
-
-    If the two others had moved together, all images of robots and cameras would be the same, but the robots would
-    have jumped with these. A motion without such a moment shows nothing.
-    """
-    (camera,), limit = verdict.cameras, chdtri(CAUSES["pose"].stop, FALSE_ALARM)
-    T = window.T.copy()
-    T[camera] = retract(window.T, verdict.fit.errors)[camera]
-    none, (cameras, markers), name = Hypothesis.of(None, (), len(window.names)), scene, window.names[camera]
-    camera_there = msgspec.structs.replace(cameras[name], T_world_cam=Pose.from_matrix(T[camera]))
-    placed = CameraArray(cameras.as_dict() | {name: camera_there}, cameras.error_scale)
-
-    def explain(at: int, known: int, mean: tuple[int, int]) -> _Explained | None:
-        keyframes = [moments.keyframe(at, known, mean, (array, markers)) for array in (cameras, placed)]
-        seen = [window_of([k], cameras, markers)[0] for k in keyframes if k is not None]
-        if keyframes[0] is None or not len(seen[0].camera):
-            return None
-        shown = max(seen, key=lambda w: np.count_nonzero(w.camera == camera))
-        moved = fit(replace(shown, T=T), none)
-        return _Explained(keyframes[0], moved, fit(replace(shown, T=window.T), none).cost - moved.cost)
-
-    k, old, new = _change(explain, len(moments.snapshots))
-    if old is None or new is None or old.gain > -limit or new.gain < old.gain + 2 * limit:
-        return False
-    expected = new.keyframe.states
-    robots = expected.retract(new.moved.bodies)
-    X = window.T[camera] @ np.linalg.inv(T[camera])  # the motion of the others, if the camera stayed
-    jumped = replace(robots, R=X[:3, :3] @ robots.R, p=robots.p @ X[:3, :3].T + X[:3, 3])
-    sigma = np.repeat(moments.prediction_sigma(k, new.keyframe.robots), 3, axis=1)
-    stay, jump = (np.sum((s.minus(expected)[:, :6] / sigma) ** 2) for s in (robots, jumped))
-    return bool(stay < chdtri(sigma.size, FALSE_ALARM) and jump - stay > limit)
-
-
-def _change(
-    explain: Callable[[int, int, tuple[int, int]], _Explained | None], n: int
-) -> tuple[int, _Explained | None, _Explained | None]:
-    """The moment, of n, after which the new pose explains more, by bisection, and then by the robots' motion before:
-    the filter follows images that changed. With the frame sets there and next."""
-    before, after = N_MEAN, n - N_MEAN - 1
-    start = explain(before, before, (0, 2 * N_MEAN)) if before < after else None
-    if start is None or start.gain > 0:  # it was so from the start
-        return 0, None, None
-    while after - before > 1:
-        middle = (before + after) // 2
-        found = explain(middle, middle, (middle - N_MEAN, middle + N_MEAN))
-        before, after = (before, middle) if found is not None and found.gain > 0 else (middle, after)
-    first, last = max(N_MEAN + 1, before - N_MEAN), min(before + N_MEAN, n - 1)
-    steps = [(k, *(explain(at, k, (k - N_MEAN, k)) for at in (k, k + 1))) for k in range(first, last)]
-    known = [(k, old, new) for k, old, new in steps if old is not None and new is not None]
-    return max(known, key=lambda step: step[2].gain - step[1].gain, default=(0, None, None))
-
-
-def _measure(
-    window: Window, verdict: Verdict, keyframes: Sequence[Keyframe], shapes: RobotShapes, since_ns: int
-) -> Measured | None:
-    times = np.array([keyframe.t_ns for keyframe in keyframes])
-    is_new = times > since_ns
-    shown = window.select(is_new)
-    if not len(shown.camera):
-        return None
-    found = fit(shown, replace(verdict.fit.hypothesis, robots=several_markers(shown)))
-    markers = {robot: np.flatnonzero(window.owner == robot) for robot in found.hypothesis.robots}
-    n = np.count_nonzero(is_new)
-    n_parts = math.ceil(n / min(WINDOWS))
-    number = (np.cumsum(is_new) - 1) * n_parts // n
-    parts = [is_new & (number == part) for part in range(n_parts)]
-    return Measured(
-        (round(times[is_new].mean()), *found.equations),
-        tuple((round(times[part].mean()), *equations_by(shown, found, part)) for part in parts),
-        shapes.learned({r: found.equations_of_places(rows) for r, rows in markers.items()}),
-    )
-
-
-def _seeing(window: Window) -> list[str]:
-    """The cameras with enough detections to determine their errors."""
-    count = np.bincount(window.camera, minlength=len(window.names))
-    return [name for name, k in zip(window.names, count, strict=True) if k >= ERRORS]
-
-
 def next_scales(
     accepted: float, claimed: float, verdict: Verdict, is_confirmed: bool, fall: float
 ) -> tuple[float, float]:
@@ -773,15 +559,6 @@ def next_scales(
     found, holds = accepted * verdict.scale, bool(verdict.cameras) or verdict.is_of_rig
     accepted = found if verdict.is_of_rig and is_confirmed else max(1.0, accepted * (1.0 if holds else FALL))
     return accepted, max(accepted, found, claimed * (1.0 if holds else fall))
-
-
-def _is_stationary(cost: Array) -> bool:
-    """Whether the mean costs (K,) of keyframes, in order of time, are alike in both halves."""
-    half = len(cost) // 2
-    if not (np.isfinite(cost[:half]).any() and np.isfinite(cost[half:]).any()):
-        return False
-    before, after = np.nanmean(cost[:half]), np.nanmean(cost[half:])
-    return bool(max(before, after) < CHANGED * min(before, after) or max(before, after) < USUAL)
 
 
 def _claim_m(window: Window) -> float:
@@ -798,41 +575,3 @@ def _sigma_px(window: Window, best: Fit, covariance: Array, k: int) -> float:
     B, claimed_px2 = best.by_camera[mine, :, :6], window.observations.detections.variance_px2[mine]
     variance = np.einsum("nai,ij,naj->n", B, covariance, B) / 2 * claimed_px2
     return float(np.sqrt(variance.mean()))
-
-
-class JudgeProcess(Executor):
-    """One process that judges: a thread would delay the poses, since it shares their GIL. It begins with
-    the first job, again after it crashed, and ends with this process, even by SIGKILL."""
-
-    def __init__(self) -> None:
-        self._pool = _pool()
-
-    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Run a function of a module with arguments that can be pickled."""
-        try:
-            return self._pool.submit(fn, *args, **kwargs)
-        except BrokenExecutor:
-            self._pool = _pool()
-            return self._pool.submit(fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the process."""
-        self._pool.shutdown(wait=wait, cancel_futures=cancel_futures)
-
-
-def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin)
-
-
-def _begin() -> None:
-    """Leave interrupts to the parent, and end with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(NICENESS)
-    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

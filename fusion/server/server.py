@@ -38,7 +38,7 @@ from fusion.protocol.pose_messages import (
     robots_digest,
     robots_key,
 )
-from fusion.rig_graph.rig_monitor import JudgeProcess
+from fusion.rig_graph.judge_process import JudgeProcess
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.arena_queries import ArenaQueries, CameraQueries
 from fusion.server.fair_use import FrameQuotas

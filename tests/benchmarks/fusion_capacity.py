@@ -24,7 +24,7 @@ from camera_node.foundation.arrays import Array
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.model.frames import FrameSet
 from fusion.protocol.pose_messages import Latency, RobotPose, TrackingState
-from fusion.rig_graph.rig_monitor import JudgeProcess
+from fusion.rig_graph.judge_process import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Ingest
 from fusion.server.server import MAX_LAG_NS, collecting_between_frame_sets

@@ -24,6 +24,7 @@ DISTORTION = (-0.09, 0.02, 0.0003, -0.0002, 0.0)
 DIAMETER_M = 0.08
 HALF = np.array([2.6, 1.6])  # of the floor that robots drive on
 FACING = 0.2  # cosine under which a print is not detected
+MARGIN_PX = 10  # of an image, in which nothing is detected
 
 
 @dataclass(frozen=True)
@@ -188,10 +189,16 @@ class Scene:
     def _noisy(self, lens: Camera, c, normal, row, rng: np.random.Generator) -> Roundels:
         sigma = self.load.sigma_px
         uv, axes, angle = outlines(lens, c.T, normal.T, DIAMETER_M / 2)
-        inside = ((uv > 10) & (uv < [lens.width - 10, lens.height - 10])).all(1)
+        least, most = MARGIN_PX, np.array([lens.width, lens.height]) - MARGIN_PX
+        inside = ((uv > least) & (uv < most)).all(1)
         inside &= axes[:, 1] >= self.load.min_px
         extra = rng.poisson(self.load.false)
-        uv = np.concatenate([uv[inside], rng.uniform(10, [lens.width - 10, lens.height - 10], (extra, 2))])
+        uv = np.concatenate(
+            [
+                uv[inside],
+                rng.uniform(least, most, (extra, 2)),
+            ]
+        )
         axes = np.concatenate([axes[inside], np.sort(rng.uniform(10, 30, (extra, 2)))[:, ::-1]])
         uv, axes = uv + sigma * rng.normal(size=uv.shape), axes + sigma * rng.normal(size=axes.shape)
         n = len(uv)

@@ -6,7 +6,7 @@ from concurrent.futures import Executor, Future
 from functools import partial
 from typing import Any
 
-from fusion.rig_graph.rig_monitor import watch
+from fusion.rig_graph.judgements import watch
 
 WATCHING = 0.1  # time of `watch` over that of a judgement
 

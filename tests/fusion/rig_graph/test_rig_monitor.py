@@ -17,8 +17,10 @@ from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.states import POSITION, FrameSetFit, Snapshot
 from fusion.rig_graph.hypotheses import CAUSES, CONFIRMED, RIVAL, Verdict
+from fusion.rig_graph.judge_process import JudgeProcess
+from fusion.rig_graph.judgements import WINDOWS, judge_latest, watch
 from fusion.rig_graph.keyframes import Keyframes
-from fusion.rig_graph.rig_monitor import WINDOWS, JudgeProcess, watch
+from fusion.rig_graph.robot_shapes import RobotShapes
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.trust import Case, run
@@ -284,6 +286,24 @@ def test_clocks_that_explain_keyframes_alike_are_in_doubt_together(n_cameras: in
     assert other.gain > chi2.isf(RIVAL, 1)
     assert set(other.offsets_s) == doubted
     assert other.offsets_s[1] == pytest.approx(0.01, rel=0.2)
+
+
+def test_keyframes_in_which_no_marker_is_assigned_show_nothing():
+    """As of robots that leave all views. A fit without an observation has no logarithm of their number: the job failed,
+    and the log had its traceback."""
+    arena = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
+    tracker, synchronizer = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS)
+    robots, keyframes = tracker.table, Keyframes(tracker.cameras, tracker.table.markers, min(WINDOWS))
+    for frame in arena.frames(90):
+        synchronizer.add(frame)
+        for frame_set in synchronizer.take(frame.t_ns):
+            tracker.track(frame_set)
+            keyframes.add(frame_set, Snapshot(frame_set.t_ns, robots.states, robots.located))
+    kept = tuple(replace(keyframe, views=()) for keyframe in keyframes.kept)
+    assert len(kept) == min(WINDOWS)
+    assert watch(kept, tracker.cameras, robots.markers).offsets_s == {}
+    shapes = RobotShapes(robots.markers)
+    assert judge_latest(kept, tracker.cameras, robots.markers, shapes, 0, ()) is None
 
 
 def test_a_process_that_judges_is_started_again_after_it_was_killed():
