@@ -143,6 +143,9 @@ def _suggest(kind: type, fault: str) -> str:
         return "; give names there, each with a colon and without a dash before it"
     if re.match("Expected `array[^`]*`, got `(int|float)`", fault):
         return "; give a list there, such as [[x, y, z]] for one marker"
+    given = re.match(r"Expected `str[^`]*`, got `object` - at `\$\.(\w+)`", fault)
+    if given and given[1] in KINDS:
+        return f"; {KINDS[given[1]]} have a file of their own: give its path there"
     match = re.fullmatch(r"Object contains unknown field `([^`]*)`(?: - at `\$(.*)`)?", fault)
     known = _fields(msgspec.inspect.type_info(kind), (match[2] or "").split(".")[1:]) if match else []
     if not match or not known:

@@ -48,6 +48,7 @@ class ServerConnection:
     def __init__(
         self, connect: Sequence[str], zenoh_config: Path | None = None, send_buffer: int | None = None
     ) -> None:
+        connect = [str(endpoint) for endpoint in connect]  # a port alone is refused as any other text
         self.endpoints = " ".join(connect)
         self._future: Future[zenoh.Session] = Future()
         self._lock = threading.Lock()

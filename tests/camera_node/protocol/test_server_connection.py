@@ -68,6 +68,8 @@ def test_the_absence_of_the_server_is_logged_once(network, caplog, monkeypatch):
 def test_invalid_endpoints_and_configurations_are_refused_at_once(network, tmp_path):
     with pytest.raises(NetworkError, match="give an endpoint such as tcp/"):
         ServerConnection(["carrier-pigeon/roof:1"])
+    with pytest.raises(NetworkError, match="give an endpoint such as tcp/"):
+        ServerConnection([7447])  # pyright: ignore[reportArgumentType]: as users may
     with pytest.raises(ConfigError, match="does not exist"):
         ServerConnection([network.endpoint], tmp_path / "none.json5")
 
