@@ -8,7 +8,7 @@
 
 namespace roundel {
 
-/// Standard deviation of the noise in grey levels, from 1 to 8, estimated from the flattest twentieth of 256
+/// Standard deviation of the noise in grey levels, 1 at least, estimated from the flattest twentieth of 256
 /// patches.
 double noise_level(const ImageView& image);
 
