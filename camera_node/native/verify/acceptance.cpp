@@ -27,7 +27,9 @@ constexpr double kMaxProcessing = 0.1;   // of the contrast: residuals that proc
 constexpr double kThinRing = 3.6;
 constexpr double kBlackInk = 0.7;      // share of the paper's level below which ink is black
 constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of uneven light may leave
-constexpr double kLarge = 160;         // pixels: bends of 5 % are fitted up to this size
+// Pixels: bends of 5 % are fitted up to 160 at a blur of 0.76, of 0.7 and a pixel. Half of the size leaves
+// 0.6 of it (0.7 and two pixels, halved).
+constexpr double kLarge = 96;
 constexpr double kFalseAlarms = 1e-4;  // rings that noise may make in a picture
 constexpr double kEnergyPixels = 100;  // of half axes squared, in which the energy of a ring is measured
 constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
