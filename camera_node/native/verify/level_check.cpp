@@ -13,13 +13,17 @@ LevelSamples check_levels(const ImageView& image, const RoundelFit& fit) {
     const double edge = 2 * fit.blur;  // levels further away are constant
     const double ring = (1 - fit.ratio) * e.minor / 2, hole = fit.ratio * e.minor / 2;
     const EllipseLevels on(e);
+    const bool uneven = fit.fields.has_light();
     LevelSamples samples;
     const auto test = [&](double scale, bool dark) {
         const auto levels = on.at(image, scale);
         for (size_t k = 0; k < kRays; ++k) {
             if (levels[k] < 0) continue;
-            const auto [x, y] = on.point(k, scale);
-            const double level = fit.fields.even_level(double(x), double(y), double(levels[k]));
+            double level = double(levels[k]);
+            if (uneven) {
+                const auto [x, y] = on.point(k, scale);
+                level = fit.fields.even_level(double(x), double(y), level);
+            }
             ++samples.total;
             samples.wrong += std::abs(fit.share(level) - (dark ? 0 : 1)) > kWrongLevel;
         }
