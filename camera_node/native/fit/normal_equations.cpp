@@ -165,7 +165,12 @@ ROUNDEL_INLINE void add_every(int step, const Gradient* chunks, int lanes, Sampl
 }
 
 /// Finds the median by halving an interval (see NormalEquations::median_residual).
-ROUNDEL_CLONES float median_of(Sample& sample) {
+ROUNDEL_CLONES float median_of(std::span<const LinearPart> parts) {
+    int lanes = 0;
+    for (const LinearPart& part : parts) lanes += part.lanes;
+    Sample sample;
+    for (const LinearPart& part : parts)
+        add_every((lanes + kSample - 1) / kSample, part.chunks, part.lanes, sample);
     auto& [residuals, slopes, most, n] = sample;
     float steep = 1e-3f;
     for (int i = 0; i < kLanes; ++i) steep = std::max(steep, most[i] / 2);
@@ -203,14 +208,7 @@ void NormalEquations::linearize(const EdgePixels& pixels, const Parameters& p) {
     }
 }
 
-double NormalEquations::median_residual() const {
-    int lanes = 0;
-    for (const LinearPart& part : parts()) lanes += part.lanes;
-    Sample sample;
-    for (const LinearPart& part : parts())
-        add_every((lanes + kSample - 1) / kSample, part.chunks, part.lanes, sample);
-    return double(median_of(sample));
-}
+double NormalEquations::median_residual() const { return double(median_of(parts())); }
 
 GaussNewtonSystem<kCount> NormalEquations::accumulate(const Weighting& by) const {
     GaussNewtonSystem<kCount> system{};

@@ -227,9 +227,7 @@ bool PhotometricFitter::approach() {
 }
 
 /// Iterates on all pixels until convergence.
-bool PhotometricFitter::finish() {
-    return select(whole_band(), EdgePixels::kMax) && (!resumed_ || resume()) && iterate(pixels_, 1);
-}
+bool PhotometricFitter::finish() { return select(whole_band(), EdgePixels::kMax) && iterate(pixels_, 1); }
 
 EdgeBand PhotometricFitter::whole_band() const {
     const bool card = std::abs(p_[kGround] - p_[kBright]) > kMinCardStep * contrast();
@@ -248,9 +246,7 @@ bool PhotometricFitter::select(EdgeBand band, int limit) {
 
 /// Iterates on a sample of the pixels, from the last frame's model to near the solution.
 bool PhotometricFitter::resume() {
-    const int one_in = pixels_.count / kResumedPixels;
-    if (one_in < kMinSampling) return true;
-    pixels_.sample(one_in, sample_);
+    pixels_.sample(pixels_.count / kResumedPixels, sample_);
     return iterate(sample_, 2);
 }
 
@@ -258,15 +254,19 @@ bool PhotometricFitter::resume() {
 /// the standard deviation. With `steps_to_go` = 2 it stops one step earlier: when the next step will
 /// reach that and the remaining error is below the noise.
 ///
-/// Fails if the last frame's model is not within a few steps of the solution. No step is taken on the
-/// sample if its residuals are no larger than the noise.
+/// Fails if the last frame's model is not within a few steps of the solution. Only if its residuals are
+/// larger than the noise, steps on a sample precede those on all pixels.
 bool PhotometricFitter::iterate(const EdgePixels& pixels, int steps_to_go) {
     const bool coarse = steps_to_go > 1;
     for (int k = 0; k < kMaxSteps; ++k) {
         linearize(pixels);
         const double seen = edge_scale();
-        if (resumed_ && coarse && seen < kSlackScale * scale_) return true;
         if (resumed_ && seen > kMaxResumedMisfit * contrast()) return false;
+        if (resumed_ && !coarse && !k && seen > kSlackScale * scale_ &&
+            pixels_.count >= kMinSampling * kResumedPixels) {
+            if (!resume()) return false;
+            continue;
+        }
         const double used = coarse ? std::min(scale_, kStrictScale * seen)
                                    : std::clamp(scale_, kStrictScale * seen, kSlackScale * seen);
         if (!solve(used)) return false;
