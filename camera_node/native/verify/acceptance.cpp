@@ -32,6 +32,7 @@ constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of 
 // 0.6 of it (0.7 and two pixels, halved).
 constexpr double kLarge = 96;
 constexpr double kFalseAlarms = 1e-4;  // rings that noise may make in a picture
+constexpr double kEnergyRows = 16;     // of half a ring, in which its energy is measured
 constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
@@ -208,7 +209,8 @@ static double ring_energy(const ImageView& image, const RoundelFit& fit) {
     const auto next = [&](double x) { return int(std::clamp(x + 1, 0.0, double(image.width))); };
     double n[2]{}, sum[2]{};
     const int first = std::max(0, int(e.y - reach) + 1), last = std::min(image.height - 1, int(e.y + reach));
-    for (int v = first; v <= last; ++v) {
+    const int step = std::max(1, int(height / kEnergyRows));
+    for (int v = first; v <= last; v += step) {
         const double y = v - e.y, x = e.x + y * lean;
         const auto half = [&](double r) {
             return width * std::sqrt(std::max(0.0, square(r) - square(y / height)));
@@ -219,8 +221,8 @@ static double ring_energy(const ImageView& image, const RoundelFit& fit) {
         const uint8_t* row = image.row(v);
         for (int k = 0; k < 5; ++k) {
             const bool ink = k % 2;
-            n[ink] += ends[k + 1] - ends[k];
-            sum[ink] += std::accumulate(row + ends[k], row + ends[k + 1], 0);
+            n[ink] += step * (ends[k + 1] - ends[k]);
+            sum[ink] += step * std::accumulate(row + ends[k], row + ends[k + 1], 0);
         }
     }
     if (!(n[0] > 0 && n[1] > 0)) return 0;
