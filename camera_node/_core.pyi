@@ -9,10 +9,18 @@ CODE_RADII: tuple[float, float]  # of the ring of sectors, outer radii of the ro
 def code_words() -> list[int]: ...  # see `geometry.codes`
 def are_plausible(uv: bytes, cov: bytes, most: float) -> bool: ...
 def unpack_detections(
-    uv: bytes, cov: bytes, axes_px: bytes, angle_rad: bytes, ratio: bytes, contrast: bytes
+    uv: bytes,
+    cov: bytes,
+    axes_px: bytes,
+    angle_rad: bytes,
+    ratio: bytes,
+    contrast: bytes,
+    id_probability: bytes,
+    rotation_rad: bytes,
+    rotation_sigma: bytes,
 ) -> NDArray[
     np.float64
-]: ...  # (11 N,) the columns of `protocol.messages.Detections`, covariances with 4 numbers
+]: ...  # (14 N,) the columns of `protocol.messages.Detections`, covariances with 4 numbers
 def distance_by_principal_axis(diameter: float, major: float) -> float: ...
 def disc_pictures(
     position: NDArray[np.float64], normal: NDArray[np.float64]

@@ -193,6 +193,7 @@ class MarkerCloud:
 def measure(
     cells: Array,
     cell_px: float,
+    error_px: float,
     uv: Array,
     cov: Array,
     axes: Array,
@@ -202,9 +203,10 @@ def measure(
     rotation: Array,
     sigma: Array,
     /,
-) -> Array:
+) -> tuple[Array, bool]:
     """(19, N) columns of a `DetectionTable` without delays, from those of `Roundels`: NaN where outlines are impossible
-    or cells are empty. cells (rows + 2, columns + 2, 20): see `native/inverse_lens.hpp`."""
+    or cells are empty; and whether no cell is. `error_px`: of the table, added to the covariances. cells (rows + 2,
+    columns + 2, 20): see `native/inverse_lens.hpp`."""
 
 def shears(axes: Array, angle: Array, centre: Array, normal: Array, radius: Array, scale: Array, /) -> Array:
     """(2, N) shears of measured ellipses relative to discs with centre and normal (3, N), camera frame."""

@@ -3,9 +3,11 @@
 
 #include <nanobind/ndarray.h>
 
+#include <algorithm>
 #include <bit>
 #include <cmath>
 #include <cstring>
+#include <limits>
 
 namespace nb = nanobind;
 
@@ -48,17 +50,22 @@ double* append(double* to, const nb::bytes& column, size_t n, size_t width,
 }
 
 /// The columns of `Detections` one after another, in one array: a NumPy array costs as much as a hundred
-/// rows.
+/// rows. Those of codes are NaN where the message has none.
 nb::object unpack_detections(const nb::bytes& uv, const nb::bytes& cov, const nb::bytes& axes_px,
-                             const nb::bytes& angle_rad, const nb::bytes& ratio, const nb::bytes& contrast) {
+                             const nb::bytes& angle_rad, const nb::bytes& ratio, const nb::bytes& contrast,
+                             const nb::bytes& id_probability, const nb::bytes& rotation_rad,
+                             const nb::bytes& rotation_sigma) {
     const size_t n = uv.size() / (2 * sizeof(double));
-    auto* data = new double[11 * n + 1];
+    auto* data = new double[14 * n + 1];
     const nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<double*>(p); });
     double* to = append<double>(data, uv, n, 2, {0, 1});
     to = append<float>(to, cov, n, 3, {0, 1, 1, 2});
     to = append<float>(to, axes_px, n, 2, {0, 1});
     for (const nb::bytes& column : {angle_rad, ratio, contrast}) to = append<float>(to, column, n, 1, {0});
-    const size_t size = 11 * n;
+    for (const nb::bytes& column : {id_probability, rotation_rad, rotation_sigma})
+        to = column.size() ? append<float>(to, column, n, 1, {0})
+                           : std::fill_n(to, n, std::numeric_limits<double>::quiet_NaN());
+    const size_t size = 14 * n;
     return nb::cast(nb::ndarray<nb::numpy, double>(data, 1, &size, owner));
 }
 

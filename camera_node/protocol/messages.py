@@ -191,21 +191,22 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
         columns["cov"] = roundels.cov.reshape(-1, 4)[:, [0, 1, 3]]
         return cls(**cls._to_bytes(columns), **header)
 
-    @np.errstate(invalid="ignore")  # as in `_check_codes`
     def unpack(self) -> Roundels:
         """Convert the columns to arrays."""
-        columns = self.uv, self.cov, self.axes_px, self.angle_rad, self.ratio, self.contrast
-        n, numbers = len(self), _core.unpack_detections(*columns)
+        shape, code = (self.angle_rad, self.ratio, self.contrast), (self.id_probability, self.rotation_rad)
+        numbers = _core.unpack_detections(self.uv, self.cov, self.axes_px, *shape, *code, self.rotation_sigma)
+        n = len(numbers) // 14
+        angle_rad, ratio, contrast, *of_code = numbers[8 * n :].reshape(6, n)
         return Roundels(
             numbers[: 2 * n].reshape(n, 2),
             numbers[2 * n : 6 * n].reshape(n, 2, 2),
             numbers[6 * n : 8 * n].reshape(n, 2),
-            numbers[8 * n : 9 * n],
-            numbers[9 * n : 10 * n],
-            numbers[10 * n :],
+            angle_rad,
+            ratio,
+            contrast,
             np.frombuffer(self.id, I4),
             np.frombuffer(self.track, I4),
-            **{name: self._column(name) for name in self.OPTIONAL if getattr(self, name)},
+            *of_code,
         )
 
     def check(self) -> None:

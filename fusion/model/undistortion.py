@@ -58,9 +58,8 @@ def measure(lens: Lens, roundels: Roundels) -> Array:
         Covariances contain the error `TOLERANCE_PX` too: cameras may claim that they have hardly any, and equations
         with such weights are singular.
     """
-    columns = table_of(lens).measure(roundels)
-    columns[COV][[0, 3]] += TOLERANCE_PX**2
-    if np.isnan(columns[XY.start]).any():
+    columns, is_complete = table_of(lens).measure(roundels)
+    if not is_complete:
         left = np.flatnonzero(np.isnan(columns[XY.start]))
         uv, outlines = columns[UV, left].T, columns[OUTLINE, left]
         xy, scale = undistort_exactly(lens, uv, half_axes_of(outlines[:2].T, outlines[2]))
@@ -116,10 +115,10 @@ class UndistortionTable:
         cells = fitted.reshape(*fitted.shape[:2], 2 * len(POWERS))
         self.coefficients = np.pad(cells, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
 
-    def measure(self, r: Roundels) -> Array:
-        """See `measure`; coordinates are NaN in empty cells."""
+    def measure(self, r: Roundels) -> tuple[Array, bool]:
+        """See `measure`; coordinates are NaN in empty cells, and the second value is False if any are."""
         raw = r.uv, r.cov, r.axes_px, r.angle_rad, r.id, r.id_probability, r.rotation_rad, r.rotation_sigma
-        return _core.measure(self.coefficients, self.cell_px, *raw)
+        return _core.measure(self.coefficients, self.cell_px, TOLERANCE_PX, *raw)
 
 
 def _monomials(st: Array) -> Array:

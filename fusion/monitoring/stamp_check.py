@@ -106,12 +106,16 @@ class StampCheck:
 def _interval(steps: Sequence[int]) -> float:
     """The usual one between frames, of which all steps are multiples if frames are missing."""
     usual = max(1.0, median(steps))
+    if _departure(steps, usual) <= MIN_IRREGULAR * usual:
+        return usual  # as of most frames
     intervals = (usual / n for n in range(1, MISSED + 1))
     return next((T for T in intervals if all(_is_multiple(step, T) for step in steps)), usual)
 
 
 def _irregularity(steps: Sequence[int], interval: float) -> float:
     """Standard deviation of stamps with these steps from the best constant rate."""
+    if _departure(steps, interval) < EXACT_NS:
+        return 0.0
     counts = [max(1, round(step / interval)) for step in steps]
     if all(abs(step - n * interval) < EXACT_NS for step, n in zip(steps, counts, strict=True)):
         return 0.0
@@ -119,6 +123,11 @@ def _irregularity(steps: Sequence[int], interval: float) -> float:
     rate, start = linear_regression(numbers, stamps)
     squares = sum((t - start - rate * n) ** 2 for n, t in zip(numbers, stamps, strict=True))
     return math.sqrt(squares / (len(stamps) - 2))
+
+
+def _departure(steps: Sequence[int], interval: float) -> float:
+    """How far the steps are from one interval."""
+    return max(max(steps) - interval, interval - min(steps))
 
 
 def _is_multiple(step: float, interval: float) -> bool:

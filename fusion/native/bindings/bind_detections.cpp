@@ -122,9 +122,9 @@ void forget_impossible(double* outlines, size_t n) {
     }
 }
 
-/// The columns of a detection table (19, N), without delays, of N roundels: impossible outlines are NaN. A
-/// number without a probability comes from a file and is no code.
-auto measure(const In<double, -1, -1, 20>& cells, double cell_px, const In<double, -1, 2>& uv,
+/// The columns of a detection table (19, N), without delays, of N roundels, and whether their cells have all
+/// of them: impossible outlines are NaN. A number without a probability comes from a file and is no code.
+auto measure(const In<double, -1, -1, 20>& cells, double cell_px, double error_px, const In<double, -1, 2>& uv,
              const In<double, -1, 2, 2>& cov, const In<double, -1, 2>& axes, const Numbers& angle,
              const In<int32_t, -1>& id, const Numbers& probability, const Numbers& rotation,
              const Numbers& sigma) {
@@ -141,17 +141,20 @@ auto measure(const In<double, -1, -1, 20>& cells, double cell_px, const In<doubl
     const Columns<2> centres{to, n};
     transpose(uv.data(), 2);
     transpose(cov.data(), 4);
+    for (double* const variance : {to - 4 * n, to - n})
+        for (size_t k = 0; k < n; ++k) variance[k] += error_px * error_px;
     double* const outlines = to;
     transpose(axes.data(), 2);
     transpose(angle.data(), 1);
     forget_impossible(outlines, n);
     look_up(lens, {centres, {outlines, n}, outlines + 2 * n}, to, to + 2 * n);
+    const bool is_complete = std::none_of(to, to + n, [](double x) { return std::isnan(x); });
     to += 6 * n;
     for (size_t k = 0; k < n; ++k) *to++ = std::isfinite(probability(k)) ? id(k) : -1;
     transpose(rotation.data(), 1);
     transpose(sigma.data(), 1);
     std::fill_n(to, n, 0.0);
-    return all;
+    return std::make_tuple(all, is_complete);
 }
 
 }  // namespace

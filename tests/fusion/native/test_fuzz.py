@@ -99,7 +99,7 @@ CALLS = {
         (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.zeros(N), np.ones((N, 1, 2))),
     ),
     "measure": (
-        partial(_core.measure, np.zeros((4, 5, 20)), 32.0),
+        partial(_core.measure, np.zeros((4, 5, 20)), 32.0, 1e-3),
         (
             *(np.ones(shape) for shape in ((N, 2), (N, 2, 2), (N, 2), N)),
             np.zeros(N, np.int32),
