@@ -53,15 +53,14 @@ def wxyz_from_rotation(R: ArrayLike) -> Array:
     Divides by the largest component (Shepperd 1978).
     """
     R = np.asarray(R, float)
-    M = R.reshape(-1, 3, 3)
-    diagonal = np.einsum("nii->ni", M)
-    trace = diagonal.sum(1, keepdims=True)
-    squares = 1 + np.concatenate([trace, 2 * diagonal - trace], axis=1)  # four times w^2, x^2, y^2, z^2
-    w, x, y, z = squares.T
-    a, b, c = (M[:, [2, 0, 1], [1, 2, 0]] - M[:, [1, 2, 0], [2, 0, 1]]).T
-    d, e, f = (M[:, [1, 0, 2], [0, 2, 1]] + M[:, [0, 2, 1], [1, 0, 2]]).T
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(R.reshape(-1, 3, 3), 0, 2)
+    trace = xx + yy + zz
+    w, x, y, z = squares = 1 + np.array(
+        [trace, 2 * xx - trace, 2 * yy - trace, 2 * zz - trace]
+    )  # 4 w^2 to 4 z^2
+    a, b, c, d, e, f = zy - yz, xz - zx, yx - xy, yx + xy, xz + zx, zy + yz
     rows = np.array([[w, a, b, c], [a, x, d, e], [b, d, y, f], [c, e, f, z]])
-    q = rows[np.argmax(squares, axis=1), :, np.arange(len(M))]
+    q = rows[np.argmax(squares, axis=0), :, np.arange(len(trace))]
     q = np.where(q[:, :1] < 0, -1.0, 1.0) * q / np.linalg.norm(q, axis=1, keepdims=True)
     return q.reshape(*R.shape[:-2], 4)
 

@@ -69,8 +69,8 @@ class _Sums:
     def zeros(cls, *shape: int) -> "_Sums":
         return cls(*np.zeros((6, *shape)))
 
-    def add(self, row: int | tuple[int, int | Index], sample: tuple[float, ...]) -> None:
-        """Add a sample to one row, or to several; those before it lose weight."""
+    def add(self, row: int | tuple[int, Index], sample: Array) -> None:
+        """Add a sample (6,) to one row, or samples (6, L) to L; those before lose weight."""
         columns = self.squares, self.bounded, self.redundancy, self.rig, self.squares_m2, self.count
         for column, value in zip(columns, sample, strict=True):
             column[row] += value - column[row] / MEMORY
@@ -149,17 +149,16 @@ class ClaimCheck:
     def _sample(
         self, robot: int, camera: Index, equations: "_Equations", information: Array, moved: Array
     ) -> None:
-        whole, _ = equations.solve(np.ones(len(camera), bool), information, moved)
-        self._all.add(robot, whole)
-        self._samples[robot] += 1
         seeing = np.unique(camera)
-        self._without.add((robot, np.delete(np.arange(self._without.squares.shape[1]), seeing)), whole)
-        for k in seeing.tolist():
-            out = camera == k
-            without, left_out_m2 = equations.solve(~out, information, moved)
-            self._without.add((robot, k), without)
-            self._left_out_m2[robot, k] += left_out_m2 - self._left_out_m2[robot, k] / MEMORY
-            self._left_out[robot, k] += out.sum() - self._left_out[robot, k] / MEMORY
+        used = np.concatenate([np.ones((1, len(camera)), bool), camera != seeing[:, None]])
+        samples, left_out_m2 = equations.solve(used, information, moved)  # by all cameras, and without each
+        self._all.add(robot, samples[:, 0])
+        self._samples[robot] += 1
+        others = np.delete(np.arange(self._without.squares.shape[1]), seeing)
+        self._without.add((robot, others), samples[:, :1])
+        self._without.add((robot, seeing), samples[:, 1:])
+        for sums, values in (self._left_out_m2, left_out_m2), (self._left_out, np.sum(~used, axis=1)):
+            sums[robot, seeing] += values[1:] - sums[robot, seeing] / MEMORY
 
     def contradictions(self) -> tuple[Contradiction, ...]:
         """What contradicts the claims; logs each when it first appears."""
@@ -230,26 +229,30 @@ class _Equations:
     metres: Array
     rig: Array
 
-    def solve(self, used: Mask, information: Array, moved: Array) -> tuple[tuple[float, ...], float]:
-        """A sample of `_Sums` from the used detections, and the squared errors (m^2) of the others by these.
+    def solve(self, used: Mask, information: Array, moved: Array) -> tuple[Array, Array]:
+        """The samples of `_Sums` (6, L) of L estimates, and the squared errors (L,), m^2, of the detections that each
+        leaves out.
 
         Args:
-            used: (N,) the detections.
+            used: (L, N) the detections of each.
             information: (12, 12) of the prediction.
             moved: (12,) from the prediction to the linearization.
         """
-        J = self.A[used].reshape(-1, 12)
-        P = _core.inverses((information + J.T @ J)[None])[0]
-        x = P @ (J.T @ self.nu[used].ravel() - information @ moved)
-        residual = self.nu - self.A @ x
-        redundancy = len(J) - float(np.einsum("ni,ij,nj->", J, P, J))
-        squares = (residual**2).sum(axis=1)
-        squares_m2, whole = squares * self.metres**2, float(squares[used].sum())
+        of_each = np.einsum("nai,naj->nij", self.A, self.A).reshape(len(self.A), -1)
+        gained = (used @ of_each).reshape(-1, 12, 12)
+        P = _core.inverses(information + gained)
+        right = used @ np.einsum("nai,na->ni", self.A, self.nu) - information @ moved
+        x = np.einsum("lij,lj->li", P, right)
+        squares = np.sum((self.nu - np.einsum("nai,li->lna", self.A, x)) ** 2, axis=2)
+        squares_m2, count = squares * self.metres**2, used.sum(axis=1)
+        redundancy = 2 * count - np.einsum("lij,lij->l", P, gained)
+        whole = np.sum(squares, axis=1, where=used)
         sample = (
             whole,
-            min(whole, MAX_RATIO * redundancy),
+            np.minimum(whole, MAX_RATIO * redundancy),
             redundancy,
-            redundancy * float(self.rig[used].mean()) if used.any() else 0.0,
-            float(squares_m2[used].sum()),
+            redundancy * (used @ self.rig) / np.maximum(count, 1),
+            np.sum(squares_m2, axis=1, where=used),
+            count,
         )
-        return (*sample, float(used.sum())), float(squares_m2[~used].sum())
+        return np.array(sample), np.sum(squares_m2, axis=1, where=~used)
