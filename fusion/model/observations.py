@@ -345,7 +345,7 @@ class DetectionTable(Columns):
         counts = [frame.columns.shape[1] for frame in frames]
         row = np.repeat(np.arange(len(frames)), counts)
         columns = np.concatenate([np.empty((N_ROWS, 0)), *(frame.columns for frame in frames)], axis=1)
-        columns[COV][[0, 3]] += cameras.error_px[exposures.camera[row]] ** 2
+        columns[COV][::3] += (cameras.error_px**2)[exposures.camera[row]]
         if exposures.line_s.any():
             columns[DELAY] = np.concatenate([frame.delays(cameras[frame.camera]) for frame in frames])
         return cls(exposures, row, columns)
@@ -412,17 +412,18 @@ class MarkerTable(Columns):
 
     def discs(self, rows: Index, frame: Index) -> Discs:
         """The markers `rows`, each in one frame."""
-        of = self.select(rows)
-        return Discs(frame, of.robot, rows, of.position, of.normal, of.radius, zero=of.zero)
+        return Discs(frame, self.robot[rows], rows, *self._shapes(rows), zero=self.zero.take(rows, 1))
 
     def expected(self, rows: Index, states: States, body: Index | None = None) -> _core.ExpectedMarkers:
         """The markers `rows` with the covariances of their positions; `body` is the row of the states of each.
 
         Without `body`, the rows of the states are those of the robots.
         """
-        of = self.select(rows)
-        body = of.robot if body is None else body
-        return _core.ExpectedMarkers(states.R, states.P, body, of.position, of.normal, of.radius)
+        body = self.robot[rows] if body is None else body
+        return _core.ExpectedMarkers(states.R, states.P, body, *self._shapes(rows))
+
+    def _shapes(self, rows: Index) -> tuple[Array, Array, Array]:
+        return self.position.take(rows, 1), self.normal.take(rows, 1), self.radius[rows]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,7 @@ different times explain an offset of an image by a velocity. But then the fit is
 a fit counts both, and is chi-square if all claims hold (Bar-Shalom et al. 2001, section 5.4).
 """
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -87,10 +88,17 @@ def camera_at_fault(cost: float, without: Mapping[int, float]) -> int | None:
 def _mean_cost(cost: Array, count: Index) -> float:
     """The cost of an equation of the median robot: 1 if the claims hold."""
     seen = count > 0
-    return float(np.median(cost[seen] / (2 * count[seen])))
+    return _median(cost[seen] / (2 * count[seen]))
 
 
 def _median_px(squared_px: Array) -> float:
     """The median residual of the visible detections; NaN without any."""
     known = squared_px[np.isfinite(squared_px)]
-    return float(np.sqrt(np.median(known))) if len(known) else np.nan
+    return math.sqrt(_median(known)) if len(known) else np.nan
+
+
+def _median(values: Array) -> float:
+    """Of at least one finite value; `np.median` takes 30 us for any number."""
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(values, (low, high))
+    return float(ordered[low] + ordered[high]) / 2

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Gathers the frames of free-running cameras into frame sets. Time comes from the data and the caller, not a clock."""
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -68,7 +68,7 @@ class FrameSynchronizer:
         self.period_ns = period_ns
         self._is_adaptive = period_ns is None
         self.lateness_ns = lateness_ns
-        self._cameras: dict[str, _CameraRate] = {}
+        self._cameras = defaultdict[str, _CameraRate](_CameraRate)
         self._waiting: list[CalibratedFrame] = []
         self._end_ns: int | None = None  # of the open frame set; None while there is none
         self._newest_ns = 0
@@ -99,7 +99,7 @@ class FrameSynchronizer:
 
     def add(self, frame: CalibratedFrame) -> bool:
         """Add a frame; return False if it is too late."""
-        camera = self._cameras.setdefault(frame.camera, _CameraRate())
+        camera = self._cameras[frame.camera]
         camera.add_lag(frame.received_ns - frame.t_ns if frame.received_ns else 0)
         if frame.t_ns < self._oldest_ns():
             camera.late += 1

@@ -6,7 +6,7 @@ depends on earlier messages and on the time of arrival, and counts what is refus
 bounded for any input.
 """
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -78,7 +78,7 @@ class Ingest:
 
     def __init__(self, keys: Keys, statistics: ServerStatistics) -> None:
         self._keys, self._statistics = keys, statistics
-        self._histories: dict[str, _FrameHistory] = {}
+        self._histories = defaultdict[str, _FrameHistory](_FrameHistory)
         self._publishers = Publishers()
         self._calibrated: set[str] = set()
         self._uncalibrated: set[str] = set()
@@ -145,7 +145,7 @@ class Ingest:
     def _note_sequence(self, message: Detections) -> None:
         """Report two publishers of one name: where nodes do not say who they are, sequence numbers that alternate show
         them."""
-        history = self._histories.setdefault(message.camera, _FrameHistory())
+        history = self._histories[message.camera]
         history.steps_back.append(message.seq <= history.seq)
         history.seq = message.seq
         has_two = self._publishers.is_contested(message.camera) or sum(history.steps_back) >= MIN_STEPS_BACK

@@ -127,7 +127,8 @@ class ServerStatistics:
         """Count a camera's frame; log a camera that is new or back."""
         if name not in self._cameras:
             log.info("camera %s appeared", name, extra=self._about(name))
-        camera = self._cameras.setdefault(name, _CameraCounts())
+            self._cameras[name] = _CameraCounts()
+        camera = self._cameras[name]
         if camera.is_gone and not camera.is_retired:
             log.info("camera %s is back", name, extra=self._about(name))
         # Only another camera with this name has a gap in the times of its frames, however late they arrive.

@@ -137,9 +137,11 @@ class Association:
             frame = np.array([number.get(id(one), -1) for one in part.frames], np.intp)  # -1: not in the set
             used = frame[part.frame] >= 0
             marker_of[first[frame[part.frame[used]]] + part.detection[used]] = part.marker[used]
-            others = part.labelings.select(frame[part.labelings.frame] >= 0)
-            at = frame[others.frame]
-            labelings.append(replace(others, frame=at, detection=others.detection + first[at[others.number]]))
+            if len(part.labelings):
+                others = part.labelings.select(frame[part.labelings.frame] >= 0)
+                at = frame[others.frame]
+                rows = others.detection + first[at[others.number]]
+                labelings.append(replace(others, frame=at, detection=rows))
         detection = np.flatnonzero(marker_of >= 0)
         return (
             detections,

@@ -169,6 +169,8 @@ def choose_labelings(
     """
     robot, camera = markers.robot[assignments.marker], detections.camera[assignments.detection]
     assignments = assignments.select(~are_unchecked(needed, robot, camera)[robot])
+    if not len(labelings):
+        return assignments
     others = labelings.select(np.isin(labelings.robot, markers.robot[assignments.marker]))
     if not len(others):
         return assignments
