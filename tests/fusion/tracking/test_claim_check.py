@@ -15,6 +15,7 @@ from fusion.model.robots import Robot
 from fusion.protocol.arena_health import describe_contradiction
 from fusion.protocol.pose_messages import Contradiction
 from fusion.server.frame_synchronizer import FrameSynchronizer
+from fusion.tracking.claim_check import MAX_RATIO, _Equations
 from fusion.tracking.tracker import Tracker
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, circle, ring
 
@@ -131,3 +132,27 @@ def test_lenses_that_are_all_wrong_blame_no_single_camera(of_four: list[Calibrat
     (found,) = contradictions(again, cameras)
     assert found.kind == "undecided"
     assert len(found.names) == 4
+
+
+def test_the_estimates_without_each_camera_are_those_of_its_detections_alone():
+    """Batches of several choices of detections against one least-squares problem each."""
+    rng = np.random.default_rng(5)
+    A, nu, metres, rig = rng.normal(size=(9, 2, 12)), rng.normal(size=(9, 2)), rng.random(9), rng.random(9)
+    root, moved = rng.normal(size=(12, 12)), rng.normal(size=12)
+    used = np.array([np.ones(9, bool), np.arange(9) % 3 > 0, np.arange(9) > 6])
+    samples, left_out_m2 = _Equations(A, nu, metres, rig).solve(used, root.T @ root, moved)
+    for k, mine in enumerate(used):
+        J = np.concatenate([A[mine].reshape(-1, 12), root])
+        x = np.linalg.lstsq(J, np.concatenate([nu[mine].ravel(), -root @ moved]))[0]
+        hat = J @ np.linalg.pinv(J)
+        squares, redundancy = np.sum((nu - A @ x) ** 2, axis=1), 2 * mine.sum() - np.trace(hat[:-12, :-12])
+        expected = (
+            squares[mine].sum(),
+            min(squares[mine].sum(), MAX_RATIO * redundancy),
+            redundancy,
+            redundancy * rig[mine].mean(),
+            (squares * metres**2)[mine].sum(),
+            mine.sum(),
+        )
+        assert samples[:, k] == pytest.approx(expected, rel=1e-6)
+        assert left_out_m2[k] == pytest.approx((squares * metres**2)[~mine].sum(), rel=1e-6, abs=1e-12)
