@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numeric>
 
 #include "verify/level_check.hpp"
 #include "verify/occluded_fit.hpp"
@@ -32,7 +31,7 @@ constexpr double kEvenResidual = 0.6;  // of the residuals, which the fields of 
 // 0.6 of it (0.7 and two pixels, halved).
 constexpr double kLarge = 96;
 constexpr double kFalseAlarms = 1e-4;  // rings that noise may make in a picture
-constexpr double kEnergyRows = 16;     // of half a ring, in which its energy is measured
+constexpr double kEnergyPixels = 100;  // of half axes squared, in which the energy of a ring is measured
 constexpr double kMaxWrong = 0.2;      // share of samples of ring and hole with a wrong level
 
 /// Tests of fits to the unmodified image, or to the smoothed one.
@@ -201,30 +200,20 @@ static bool has_black_ink(const RoundelFit& fit) {
 /// levels of its ink and of the paper in and around it, times the pixels that determine the difference.
 static double ring_energy(const ImageView& image, const RoundelFit& fit) {
     const Ellipse& e = fit.outer;
-    // A row that is y below the centre has the pixels of an ellipse r times as large about y lean, up to a
-    // distance of width (r^2 - (y / height)^2)^(1/2).
-    const Symmetric S = from_eigenvalues(square(e.major / 2), square(e.minor / 2), e.angle);
-    const double height = std::sqrt(S.yy), lean = S.xy / S.yy, width = std::sqrt(S.det()) / height;
-    const double reach = kMinCard * height;
-    const auto next = [&](double x) { return int(std::clamp(x + 1, 0.0, double(image.width))); };
+    const double a = e.major / 2, b = e.minor / 2, c = std::cos(e.angle), s = std::sin(e.angle);
+    const double ax = c / a, ay = s / a, bx = -s / b, by = c / b, reach = kMinCard * a;
+    const int step = std::max(1, int(a * b / kEnergyPixels));
     double n[2]{}, sum[2]{};
-    const int first = std::max(0, int(e.y - reach) + 1), last = std::min(image.height - 1, int(e.y + reach));
-    const int step = std::max(1, int(height / kEnergyRows));
-    for (int v = first; v <= last; v += step) {
-        const double y = v - e.y, x = e.x + y * lean;
-        const auto half = [&](double r) {
-            return width * std::sqrt(std::max(0.0, square(r) - square(y / height)));
-        };
-        const double card = half(kMinCard), disc = half(1), hole = half(fit.ratio);
-        const int ends[]{next(x - card), next(x - disc), next(x - hole),
-                         next(x + hole), next(x + disc), next(x + card)};
-        const uint8_t* row = image.row(v);
-        for (int k = 0; k < 5; ++k) {
-            const bool ink = k % 2;
-            n[ink] += step * (ends[k + 1] - ends[k]);
-            sum[ink] += step * std::accumulate(row + ends[k], row + ends[k + 1], 0);
+    for (int v = std::max(0, int(e.y - reach)); v <= std::min(image.height - 1, int(e.y + reach)); ++v)
+        for (int u = std::max(0, int(e.x - reach)) + v % step;
+             u <= std::min(image.width - 1, int(e.x + reach)); u += step) {
+            const double x = u - e.x, y = v - e.y;
+            const double squared = square(ax * x + ay * y) + square(bx * x + by * y);
+            if (squared > square(kMinCard)) continue;
+            const bool ink = squared > square(fit.ratio) && squared < 1;
+            n[ink] += step;
+            sum[ink] += step * double(image.row(v)[u]);
         }
-    }
     if (!(n[0] > 0 && n[1] > 0)) return 0;
     return square(sum[0] / n[0] - sum[1] / n[1]) * n[0] * n[1] / (n[0] + n[1]);
 }
