@@ -124,10 +124,10 @@ void forget_impossible(double* outlines, size_t n) {
 
 /// The columns of a detection table (19, N), without delays, of N roundels, and whether their cells have all
 /// of them: impossible outlines are NaN. A number without a probability comes from a file and is no code.
-auto measure(const In<double, -1, -1, 20>& cells, double cell_px, double error_px, const In<double, -1, 2>& uv,
-             const In<double, -1, 2, 2>& cov, const In<double, -1, 2>& axes, const Numbers& angle,
-             const In<int32_t, -1>& id, const Numbers& probability, const Numbers& rotation,
-             const Numbers& sigma) {
+auto measure(const In<double, -1, -1, 20>& cells, double cell_px, double error_px,
+             const In<double, -1, 2>& uv, const In<double, -1, 2, 2>& cov, const In<double, -1, 2>& axes,
+             const Numbers& angle, const In<int32_t, -1>& id, const Numbers& probability,
+             const Numbers& rotation, const Numbers& sigma) {
     if (cells.shape(0) < 3 || cells.shape(1) < 3) throw nb::value_error("a table without cells");
     const InverseLens lens{cells.data(), int64_t(cells.shape(1)) - 2, int64_t(cells.shape(0)) - 2, cell_px};
     const size_t n = uv.shape(0);

@@ -190,9 +190,8 @@ def test_noise_of_dark_places_makes_no_roundels(camera: Camera, level: float):
 
 
 def test_noise_of_a_dim_room_hides_no_roundels():
-    """A limit of six deviations of the noise refused 9 in 10, once the tone curve was known, and noise that counted as 8
-    grey levels at most 1 in 5 in the first picture, where it has 9 to 22. Of 60 roundels 0.95 are due, with a
-    binomial deviation of 0.028."""
+    """A limit of six deviations of the noise refused 9 in 10, once the tone curve was known, and noise that counted as
+    8 grey levels at most 1 in 5 in the first picture, where it has 9 to 22."""
     for detector in (Detector(), known(DIM)):
         assert share_found(detector, DIM, dim, 2) > 0.9
 

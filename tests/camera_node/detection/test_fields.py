@@ -35,8 +35,8 @@ def test_a_bend_is_removed_from_the_outline_and_its_unknown_part_is_claimed(diam
     ],
 )
 def test_strongly_bent_paper_is_found_when_large(bend, diameter, share):
-    """Edges are displaced in proportion to the size: at full size alone, 5 of 8 of 300 px are found, and 7 where half of
-    the size was the least."""
+    """Edges are displaced in proportion to the size: at full size alone, 5 of 8 of 300 px are found, and 7 where half
+    of the size was the least."""
     measured = measure_bend(RUN, bend, diameter, 8)
     assert measured.found > share
     assert measured.centre < CLAIM
