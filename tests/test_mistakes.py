@@ -257,6 +257,7 @@ STARTED = (
     "a server's address that is a port only",
     "a bridge at a port that there is not",
     "a server without a file of robots",
+    "the robots as the settings of a server",
 )
 WITHOUT_ADVICE = ("nothing to undo", "undo without a change")
 
