@@ -111,6 +111,7 @@ def watch(keyframes: Sequence[Keyframe], cameras: CameraArray, markers: MarkerTa
 
 
 def blames_one_of_three(window: Window, verdict: Verdict) -> bool:
+    """Whether a camera is to be excluded that `confirm` should judge: two others that moved together look like it."""
     return verdict.cause == "pose" and len(seeing(window)) <= MIN_FOR_PAIRS
 
 

@@ -11,7 +11,7 @@ poses that are wrong.
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -23,11 +23,10 @@ from rich.table import Table
 from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Mask
 from camera_node.foundation.terminal import console, track
-from fusion.model.observations import CameraArray, Exposures, MarkerTable
 from fusion.protocol.pose_messages import RobotPose
 from tests.benchmarks.faults.judge import PoseJudge
 from tests.benchmarks.faults.virtual_arena import VirtualArena
-from tests.benchmarks.fusion_load import FACING, MARGIN_PX, Load
+from tests.benchmarks.fusion_load import Load, Scene
 
 NARROWER = 2.0  # focal lengths over those with which all cameras see the floor of the robots
 SHOWN = 3  # markers by which a camera shows a robot
@@ -47,31 +46,22 @@ class NarrowLoad(Load):
 
 
 class Visibility:
-    """Which robots two cameras see."""
+    """Which robots two cameras see, by what they detect without noise and without losses."""
 
     def __init__(self, load: Load) -> None:
-        self._load, self._cameras = load, CameraArray(load.rig)
-        self._markers = MarkerTable.of(list(load.bodies.values()))
-        n, n_cameras = len(self._markers), len(load.rig)
-        self._camera = np.repeat(np.arange(n_cameras), n)
-        self._discs = self._markers.discs(np.tile(np.arange(n), n_cameras), self._camera)
-        self._exposures = Exposures.exact(np.arange(n_cameras), np.zeros(n_cameras))
+        self._scene = Scene(replace(load, missing=0.0, false=0.0, sigma_px=0.0))
+        self._robot = self._scene.marker_table.robot
+        self._due = np.minimum(SHOWN, np.bincount(self._robot))
 
     def seen(self, t_s: float) -> Mask:
         """(robots,) whether two cameras or more see each of them at a time of the load."""
-        views = self._cameras.views(self._load.paths.at(t_s), self._exposures, self._discs)
-        c = views.centre
-        visible = (-np.sum(c * views.normal, axis=0) > FACING * np.linalg.norm(c, axis=0)) & (c[2] > 0.1)
-        for k, camera in enumerate(self._load.rig.values()):
-            mine = np.flatnonzero(visible & (self._camera == k))
-            uv = camera.project(c[:, mine].T)
-            inside = (uv > MARGIN_PX) & (uv < np.array([camera.width, camera.height]) - MARGIN_PX)
-            visible[mine] = inside.all(axis=1)
-        n_robots = len(self._load.bodies)
-        row = self._camera * n_robots + np.tile(self._markers.robot, len(self._load.rig))
-        count = np.bincount(row, visible, n_robots * len(self._load.rig)).reshape(-1, n_robots)
-        due = np.minimum(SHOWN, np.bincount(self._markers.robot, minlength=n_robots))
-        return np.asarray((count >= due).sum(axis=0) >= 2, bool)
+        scene, rng = self._scene, np.random.default_rng(0)  # of the order of detections
+        states = scene.load.paths.at(t_s)
+        count = [
+            np.bincount(self._robot[scene.roundels(k, states, rng).track], minlength=len(self._due))
+            for k in range(len(scene.cameras.names))
+        ]
+        return np.asarray((np.array(count) >= self._due).sum(axis=0) >= 2, bool)
 
 
 @dataclass

@@ -4,6 +4,7 @@
 import contextlib
 import os
 import signal
+from collections.abc import Iterable
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 
@@ -19,7 +20,7 @@ from fusion.model.states import POSITION, FrameSetFit, Snapshot
 from fusion.rig_graph.hypotheses import CAUSES, CONFIRMED, RIVAL, Verdict
 from fusion.rig_graph.judge_process import JudgeProcess
 from fusion.rig_graph.judgements import WINDOWS, judge_latest, watch
-from fusion.rig_graph.keyframes import Keyframes
+from fusion.rig_graph.keyframes import Keyframe, Keyframes
 from fusion.rig_graph.robot_shapes import RobotShapes
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
@@ -270,19 +271,28 @@ def test_a_clock_that_a_judgement_blames_is_in_doubt_until_others_confirm_it():
     assert not monitors.rig.clock_doubts
 
 
+def gathered(arena: Arena, frames: Iterable[CalibratedFrame]) -> tuple[Tracker, tuple[Keyframe, ...]]:
+    """A tracker that followed the frames, and the last keyframes."""
+    tracker, synchronizer = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS)
+    robots, keyframes = tracker.table, Keyframes(tracker.cameras, tracker.table.markers, min(WINDOWS))
+    for frame in frames:
+        synchronizer.add(frame)
+        for frame_set in synchronizer.take(frame.t_ns):
+            tracker.track(frame_set)
+            keyframes.add(frame_set, Snapshot(frame_set.t_ns, robots.states, robots.located))
+    return tracker, tuple(keyframes.kept)
+
+
 @pytest.mark.parametrize(("n_cameras", "doubted"), [(2, {0, 1}), (4, {1})])
 def test_clocks_that_explain_keyframes_alike_are_in_doubt_together(n_cameras: int, doubted: set[int]):
     """The stamps of cam1 jump by 10 ms: two cameras show only the difference of their clocks."""
     arena = Arena(ROBOTS, MOTIONS, cameras=dict(list(ring().items())[:n_cameras]), sigma_px=0.1)
-    tracker, synchronizer = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS)
-    robots, keyframes = tracker.table, Keyframes(tracker.cameras, tracker.table.markers, min(WINDOWS))
-    for frame in arena.frames(90):
-        jumped = frame.camera == "cam1" and arena.seconds(frame.t_ns) > 1.0
-        synchronizer.add(replace(frame, t_ns=frame.t_ns + 10_000_000 * jumped))
-        for frame_set in synchronizer.take(frame.t_ns):
-            tracker.track(frame_set)
-            keyframes.add(frame_set, Snapshot(frame_set.t_ns, robots.states, robots.located))
-    other = watch(tuple(keyframes.kept), tracker.cameras, robots.markers)
+    jumped = [
+        replace(f, t_ns=f.t_ns + 10_000_000 * (f.camera == "cam1" and arena.seconds(f.t_ns) > 1.0))
+        for f in arena.frames(90)
+    ]
+    tracker, keyframes = gathered(arena, jumped)
+    other = watch(keyframes, tracker.cameras, tracker.table.markers)
     assert other.gain > chi2.isf(RIVAL, 1)
     assert set(other.offsets_s) == doubted
     assert other.offsets_s[1] == pytest.approx(0.01, rel=0.2)
@@ -292,18 +302,11 @@ def test_keyframes_in_which_no_marker_is_assigned_show_nothing():
     """As of robots that leave all views. A fit without an observation has no logarithm of their number: the job failed,
     and the log had its traceback."""
     arena = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
-    tracker, synchronizer = Tracker(arena.cameras, ROBOTS), FrameSynchronizer(PERIOD_NS)
-    robots, keyframes = tracker.table, Keyframes(tracker.cameras, tracker.table.markers, min(WINDOWS))
-    for frame in arena.frames(90):
-        synchronizer.add(frame)
-        for frame_set in synchronizer.take(frame.t_ns):
-            tracker.track(frame_set)
-            keyframes.add(frame_set, Snapshot(frame_set.t_ns, robots.states, robots.located))
-    kept = tuple(replace(keyframe, views=()) for keyframe in keyframes.kept)
-    assert len(kept) == min(WINDOWS)
-    assert watch(kept, tracker.cameras, robots.markers).offsets_s == {}
-    shapes = RobotShapes(robots.markers)
-    assert judge_latest(kept, tracker.cameras, robots.markers, shapes, 0, ()) is None
+    tracker, keyframes = gathered(arena, arena.frames(90))
+    empty, markers = tuple(replace(keyframe, views=()) for keyframe in keyframes), tracker.table.markers
+    assert len(empty) == min(WINDOWS)
+    assert watch(empty, tracker.cameras, markers).offsets_s == {}
+    assert judge_latest(empty, tracker.cameras, markers, RobotShapes(markers), 0, ()) is None
 
 
 def test_a_process_that_judges_is_started_again_after_it_was_killed():
