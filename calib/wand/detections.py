@@ -7,6 +7,7 @@ One row per detection, frames and cameras by index.
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from operator import attrgetter
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera
 from calib.wand.trajectory import finite_velocities, hermite
-from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.foundation.columns import Columns
 from camera_node.geometry.body import Body
 from camera_node.geometry.codes import PLAIN
@@ -400,6 +401,18 @@ class WandRecording:
     def select(self, rows: NDArray) -> "WandRecording":
         """The recording with the detections that a mask or an index array selects."""
         return self.with_detections(self.detections.select(rows))
+
+    def timed(self) -> Mask:
+        """(n,) which detections the uncertainty of their stamps displaces by less than their noise, at the speed of the
+        marker's image."""
+        detections, markers = self.detections, len(self.wand.markers)
+        rows = group_rows(detections.camera * markers + detections.label, len(self.lenses) * markers)
+        focal_px = np.array([(lens.fx + lens.fy) / 2 for lens in self.lenses])
+        speed = np.empty(len(detections))
+        for mine, track in zip(rows, chain.from_iterable(self.tracks), strict=True):
+            speed[mine] = np.linalg.norm(track.velocity, axis=1)
+        off_px = detections.stamp_sigma_s * speed * focal_px[detections.camera]
+        return np.asarray(off_px**2 <= np.einsum("nii->n", detections.cov), bool)
 
     def with_centres(self, rows: Index, uv: Array) -> "WandRecording":
         """The recording with other centres (n, 2), raw pixels, of the detections `rows` (n,)."""

@@ -182,22 +182,24 @@ class TriangulatedResiduals:
 
 def triangulated_residuals(recording: WandRecording, state: State) -> TriangulatedResiduals:
     """Triangulate the marker of each detection, robustly, from it and from the other cameras' detections at its true
-    time, equal or interpolated.
+    time, equal or interpolated. Those whose stamps are too uncertain for that are left out (`WandRecording.timed`).
 
     Args:
         recording: labeled detections of C cameras.
         state: poses, clocks and lenses of these cameras.
     """
     lenses = [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
-    recording = recording.with_row_times(state.clocks[:, 2]).undistort_tracks(lenses)
-    count = len(recording.detections)
+    timed = recording.timed()
+    count = len(timed)
+    recording = recording.select(timed).with_row_times(state.clocks[:, 2]).undistort_tracks(lenses)
     points, pixels = np.full((count, 3), np.nan), np.full((count, 2), np.nan)
     range_m, focal_px = np.full(count, np.nan), np.empty(count)
     for camera, lens in enumerate(lenses):
-        rows, T = np.flatnonzero(recording.detections.camera == camera), state.cameras[camera]
-        points[rows] = _triangulate_rows(recording, state, lens, camera, rows)
+        mine, T = np.flatnonzero(recording.detections.camera == camera), state.cameras[camera]
+        rows = np.flatnonzero(timed)[mine]
+        points[rows] = _triangulate_rows(recording, state, lens, camera, mine)
         away = points[rows] - T[:3, 3]
-        pixels[rows] = recording.detections.uv[rows] - lens.project(away @ T[:3, :3])
+        pixels[rows] = recording.detections.uv[mine] - lens.project(away @ T[:3, :3])
         range_m[rows] = np.linalg.norm(away, axis=1)
         focal_px[rows] = (lens.fx + lens.fy) / 2
     return TriangulatedResiduals(points, pixels, range_m, focal_px)
