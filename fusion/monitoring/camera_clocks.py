@@ -189,6 +189,10 @@ class CameraClocks:
             frame = replace(frame, t_ns=frame.t_ns + round(1e9 * correction_s), clock_sigma_s=sigma_s)
         return None if frame.t_ns > frame.received_ns + MAX_AHEAD_NS else frame
 
+    def rate(self, name: str) -> float:
+        """By which the correction of a camera's stamps grows."""
+        return self._clocks[name].rate
+
     def correct(self, departure: Departure) -> None:
         """Correct the clock of a camera that departs from the others."""
         clock, t_ns = self._clocks[self._names[departure.camera]], departure.t_ns

@@ -9,6 +9,7 @@ from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import FrameSetFit, Snapshot
+from fusion.monitoring.arrival_rates import ArrivalRates
 from fusion.monitoring.camera_clocks import CameraClocks, uncertain
 from fusion.monitoring.frozen_images import FrozenImages
 from fusion.rig_graph.rig_monitor import RigMonitor
@@ -25,6 +26,7 @@ class CameraMonitors:
     def __init__(self, cameras: CameraArray, markers: MarkerTable) -> None:
         self._cameras = cameras
         self.clocks = CameraClocks(cameras.names)
+        self._arrivals = ArrivalRates()
         self.frozen = FrozenImages(cameras, markers)
         self.rig = RigMonitor(cameras, markers)
 
@@ -36,6 +38,7 @@ class CameraMonitors:
     def inherit(self, old: "CameraMonitors", same: Mapping[int, int]) -> None:
         """Continue with the same cameras and other robots; `same` has old rows by new row."""
         self.clocks.inherit(old.clocks)
+        self._arrivals = old._arrivals
         self.frozen.inherit(old.frozen)
         self.rig.inherit(old.rig, same)
 
@@ -51,6 +54,7 @@ class CameraMonitors:
         sigmas = self.clocks.observe(frame)
         if any(sigmas):
             self.rig.jump(frame.camera, *sigmas)
+            self._arrivals.forget(frame.camera)
         admitted = self.clocks.admit(frame)
         return None if admitted is None or self.frozen.is_frozen(admitted, robots_now) else admitted
 
@@ -69,6 +73,10 @@ class CameraMonitors:
         recalibrates: bool,
     ) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
         """Exclude moved cameras, apply recalibrated poses and correct clocks; see `RigMonitor.check`."""
+        for frame in frame_set.frames:
+            if (shown := self._arrivals.add(frame)) is not None:
+                rate = shown.rate - self.clocks.rate(frame.camera)
+                self.rig.hear(frame.camera, frame.t_ns, rate, shown.sigma)
         corrections = self.rig.check(frame_set, now, fit, recalibrates)
         for departure in self.rig.take_departures():
             self.clocks.correct(departure)

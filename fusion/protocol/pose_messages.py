@@ -276,7 +276,8 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
 
     Columns, one row a frame: `stamps` (F,) <i8 the `t_ns` of its `Detections`; `times` (F,) <i8 its capture time as it
     was used, ns; `clock_sigmas` (F,) <f8 the standard deviation of that by the clock, seconds; `stamp_sigmas` (F,) <f8
-    that by errors of single stamps, empty of older servers. `judged`: how many judgements of the cameras, which run
+    that by errors of single stamps, and `arrivals` (F,) <i8 when the messages arrived, ns; both empty of older servers.
+    `judged`: how many judgements of the cameras, which run
     beside tracking, the server took after it; None of older servers.
     """
 
@@ -287,6 +288,7 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
     times: bytes
     clock_sigmas: bytes
     stamp_sigmas: bytes = b""
+    arrivals: bytes = b""
     judged: int | None = None
 
     @classmethod
@@ -300,22 +302,31 @@ class FusedFrames(msgspec.Struct, frozen=True, kw_only=True):
             times=np.array([frame.t_ns for frame in frames], "<i8").tobytes(),
             clock_sigmas=np.array([frame.clock_sigma_s for frame in frames], "<f8").tobytes(),
             stamp_sigmas=np.array([frame.stamp_sigma_s for frame in frames], "<f8").tobytes(),
+            arrivals=np.array([frame.received_ns for frame in frames], "<i8").tobytes(),
             judged=judged,
         )
 
     def check(self) -> None:
         """Raise MessageError unless the columns' sizes agree."""
         n = 8 * len(self.cameras)
-        of_stamps = len(self.stamp_sigmas) or n
-        if not len(self.stamps) == len(self.times) == len(self.clock_sigmas) == of_stamps == n:
+        columns = (
+            self.stamps,
+            self.times,
+            self.clock_sigmas,
+            self.stamp_sigmas or bytes(n),
+            self.arrivals or bytes(n),
+        )
+        if any(len(column) != n for column in columns):
             raise MessageError(f"the columns have other sizes than those of {len(self.cameras)} frames")
 
-    def rows(self) -> list[tuple[str, int, int, float, float]]:
-        """Camera, stamp, capture time (ns) and its standard deviations by the clock and by single stamps (s) of each
-        frame."""
-        times = [np.frombuffer(column, "<i8").tolist() for column in (self.stamps, self.times)]
-        of_stamps = self.stamp_sigmas or bytes(len(self.clock_sigmas))
-        sigmas = [np.frombuffer(column, "<f8").tolist() for column in (self.clock_sigmas, of_stamps)]
+    def rows(self) -> list[tuple[str, int, int, int, float, float]]:
+        """Camera, stamp, capture time, arrival (ns; 0 where unknown), and the standard deviations of the capture time
+        by the clock and by single stamps (s), of each frame."""
+        unknown = bytes(len(self.stamps))
+        of_times = self.stamps, self.times, self.arrivals or unknown
+        of_sigmas = self.clock_sigmas, self.stamp_sigmas or unknown
+        times = [np.frombuffer(column, "<i8").tolist() for column in of_times]
+        sigmas = [np.frombuffer(column, "<f8").tolist() for column in of_sigmas]
         return list(zip(self.cameras, *times, *sigmas, strict=True))
 
 

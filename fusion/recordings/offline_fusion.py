@@ -305,9 +305,9 @@ def _is_complete(fused: FusedFrames, held: "Held") -> bool:
 
 
 def _frames(fused: FusedFrames, messages: "Held", cameras: dict[str, Camera]) -> Iterator[CalibratedFrame]:
-    for name, stamp_ns, t_ns, clock_sigma_s, stamp_sigma_s in fused.rows():
+    for name, stamp_ns, t_ns, received_ns, clock_sigma_s, stamp_sigma_s in fused.rows():
         message = messages.get((name, stamp_ns))
-        frame = None if message is None else admit(message, cameras)
+        frame = None if message is None else admit(message, cameras, received_ns)
         if isinstance(frame, CalibratedFrame):
             yield replace(frame, t_ns=t_ns, clock_sigma_s=clock_sigma_s, stamp_sigma_s=stamp_sigma_s)
 

@@ -7,6 +7,7 @@ estimate, by a margin over every other one: a generalized likelihood ratio, as i
 docs/design/time_offsets.md has the equations.
 """
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,13 +16,14 @@ from scipy.special import chdtri
 
 from calib.rig.camera_errors import ERRORS
 from camera_node.foundation.arrays import Array, Index
-from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, INTERVAL_NS, RIVAL
+from fusion.rig_graph.hypotheses import CAUSES, FALSE_ALARM, FREE_SIGMA, INTERVAL_NS, RIVAL, explained
 
 OFFSET_SIGMA_S = 5e-4  # of a calibrated clock
 RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crystals have 1e-4, bad drivers more
 # Of an offset, s, and a rate that changed: cameras have stated rates that are 1 % wrong.
 CHANGED_SIGMA = 0.1, 1e-2
 RATE_WALK = 1e-4  # change of a rate in a second: a daemon that slews a clock changes it by 5e-4 at once
+MAX_HEARD = 60  # rates of a clock by arrivals, of half a minute, that wait for keyframes
 MEMORY_S = 10.0  # of errors of poses and lenses: what they do to offsets varies with the places of robots
 
 
@@ -42,12 +44,9 @@ class Departure:
 
 
 def other_offsets(P: Array, H: Array, y: Array) -> tuple[Array, Array]:
-    """(C,) how much less keyframes cost if the clock of one camera alone has any other offset, and (C,) that offset, s:
-    a rank-one change of the covariance P (8 C, 8 C) of the cameras' errors, of which the keyframes show H e = y."""
-    offsets = ERRORS * np.arange(len(y) // ERRORS) + CAUSES["clock"].start
-    with_them = np.linalg.solve(np.eye(len(y)) + H @ P, np.column_stack([y, H]))
-    score, information = with_them[offsets, 0], np.diag(with_them[:, 1:])[offsets] + CHANGED_SIGMA[0] ** -2
-    return score**2 / information, score / information
+    """(C,) how much less keyframes cost if the clock of one camera alone has any other offset, and (C,) that offset, s;
+    see `explained`."""
+    return explained(P, H, y, np.eye(len(y))[:, CAUSES["clock"].start :: ERRORS], CHANGED_SIGMA[0])
 
 
 class ClockWalk:
@@ -65,7 +64,9 @@ class ClockWalk:
     """
 
     def __init__(self, n_cameras: int) -> None:
-        self._n, self._t_ns, self.departed = n_cameras, 0, list[int]()
+        self._n, self.departed = n_cameras, list[int]()
+        self._t_ns = self._shown_ns = 0  # of the estimate, and of the last keyframes
+        self._heard = deque[tuple[int, int, float, float]](maxlen=MAX_HEARD * n_cameras)
         self.is_suspicious = False
         self._drift = np.zeros(n_cameras)  # rates that explain what the last keyframes show of the offsets
         self.rates = ERRORS * n_cameras + np.arange(n_cameras)
@@ -102,10 +103,42 @@ class ClockWalk:
     def jump(self, camera: int, sigma_s: float, rate_sigma: float) -> None:
         """The stamps of a camera were corrected by a jump with this standard deviation, or may have jumped so far.
         Their rate was corrected until then by as much as `rate_sigma`."""
+        heard = [entry for entry in self._heard if entry[1] != camera]
+        self._heard.clear()
+        self._heard.extend(heard)
         self.P[self.offsets[camera], self.offsets[camera]] += sigma_s**2
         self.P[self.rates[camera], self.rates[camera]] += rate_sigma**2
         self._most[self.rates[camera]] = CHANGED_SIGMA[1]
         self._depart(camera)
+
+    def hear(self, t_ns: int, camera: int, rate: float, sigma: float) -> None:
+        """Take the rate of a clock by the arrivals of its frames, which counts with the keyframes after that time. If
+        sigma is infinite, the clock may have that rate: it is as uncertain."""
+        self._heard.append((t_ns, camera, rate, sigma))
+
+    def listen(self, t_ns: int) -> None:
+        """Predict to a time, by the rates that were heard until then. A rate beyond chance shows that the clock
+        changed, or a delay, which the next ones decide."""
+        while self._heard and self._heard[0][0] <= t_ns:
+            _, camera, rate, sigma = self._heard.popleft()
+            row = self.rates[camera]
+            off, variance = rate - self.x[row], self.P[row, row] + sigma**2
+            if np.isinf(sigma) or off**2 > chdtri(1, FALSE_ALARM) * variance:
+                self.P[row, row] = max(self.P[row, row], off**2)
+                self._most[row] = max(self._most[row], abs(off))
+            else:
+                gain = self.P[:, row] / variance
+                self.x, self.P = self.x + gain * off, self.P - np.outer(gain, self.P[row])
+        self._predict(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
+        self._t_ns = max(t_ns, self._t_ns)
+
+    def offsets_at(self, t_ns: int) -> tuple[Array, Array]:
+        """(C,) offsets as they are known for a time, and their covariance (C, C)."""
+        dt = max(0, t_ns - (self._t_ns or t_ns)) * 1e-9
+        later = np.zeros((self._n, len(self.x)))
+        later[np.arange(self._n), self.offsets], later[np.arange(self._n), self.rates] = 1.0, dt
+        walk = RATE_WALK**2 * dt**3 / 3 * np.eye(self._n)
+        return later @ self.x, np.asarray(later @ self.P @ later.T + walk, float)
 
     def _depart(self, camera: int) -> None:
         """At least one clock is held to be right: the windows show differences."""
@@ -121,9 +154,9 @@ class ClockWalk:
         even if less than what `judge` finds: its pose must not look like a clock. Then they are not used, and poses are
         forgotten; returns False.
         """
-        interval_s = max(0, t_ns - (self._t_ns or t_ns)) * 1e-9
-        self._predict(interval_s)
-        self._t_ns, seen = t_ns, slice(0, len(y))
+        interval_s = max(0, t_ns - (self._shown_ns or t_ns)) * 1e-9
+        self.listen(t_ns)
+        self._shown_ns, seen = t_ns, slice(0, len(y))
         off, limit = y - H @ self.x[seen], chdtri(len(y), FALSE_ALARM)
         free = np.linalg.solve(H + np.diag(np.tile(FREE_SIGMA**-2, self._n)), off)
 
@@ -211,6 +244,9 @@ class ClockWalk:
             for k in self._corrected.difference(self.departed)
             for _, of_k, s_of_k in [explain([*self.departed, k])]
         ]
+        rates = {d.camera: d.rate for d in departures}  # of which stamps are corrected
+        for n, (at_ns, camera, rate, s_rate) in enumerate(self._heard):
+            self._heard[n] = at_ns, camera, rate - rates.get(camera, 0.0), s_rate
         if self._n > 2:  # of two, the one that departed before departs again
             self.departed = [
                 d.camera for d in departures if d.sigma_s > OFFSET_SIGMA_S or d.rate_sigma > RATE_SIGMA / 2

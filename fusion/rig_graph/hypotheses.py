@@ -32,7 +32,10 @@ Cause = Literal["pose", "clock", "focal", "wand", "shape"]
 # Standard deviations of errors that a hypothesis frees: weak, they only keep the system regular. Arrivals show larger
 # jumps of a clock.
 FREE_SIGMA = np.array([0.3] * 3 + [0.5] * 3 + [0.1, 0.1])
-WAND_SIGMA = 0.05  # of the rig's size, if the lengths of the wand are wrong
+# Of what all cameras have in common: the rig's size, if the lengths of the wand are wrong, and their focal lengths,
+# which a temperature changes together.
+COMMON_SIGMA: dict["Common", float] = {"size": 0.05, "focal": 0.1}
+Common = Literal["size", "focal"]
 FREE_SHAPE_M = 0.02  # of a marker's place that was measured or drawn wrong
 POSE_SIGMA = 1.0, 1.0  # of a robot, rad and m: its keyframe alone determines it
 FALSE_ALARM = 1e-6  # probability of a chi-square test that decides
@@ -102,10 +105,11 @@ class Window:
         """(N,) of each observation, of the M markers."""
         return np.searchsorted(self.markers, self.observations.discs.marker)
 
-    @property
-    def growth(self) -> Array:
-        """(8 C,) errors of the cameras by the logarithm of the rig's size."""
-        return errors_of_size(self.T)
+    def common(self, of: Common) -> Array:
+        """(8 C,) errors of the cameras by the logarithm of the rig's size, or of all focal lengths."""
+        if of == "size":
+            return errors_of_size(self.T)
+        return np.tile(np.arange(ERRORS) == CAUSES["focal"].start, len(self.names)).astype(float)
 
     def covariance(self, scale: float) -> Array:
         """(8 C, 8 C) of the errors of the cameras, if those of the calibration are larger than it states."""
@@ -135,8 +139,8 @@ class Window:
 class Hypothesis:
     """The errors (C, 8) that are free, and where the search for them begins (C, 8); `cameras` are those at fault.
 
-    The standard deviations of all other errors are `scale` times those of the calibration. If `has_other_size`, the
-    size of the whole rig is free as well, and the places of the markers of `robots`.
+    The standard deviations of all other errors are `scale` times those of the calibration. What all cameras have in
+    `common` is free as well, and the places of the markers of `robots`.
     """
 
     cause: Cause | None
@@ -144,7 +148,7 @@ class Hypothesis:
     free: Mask
     start: Array
     scale: float = 1.0
-    has_other_size: bool = False
+    common: Common | None = None
     robots: tuple[int, ...] = ()
 
     @classmethod
@@ -162,9 +166,16 @@ class Hypothesis:
         """Twice the logarithm of how much less probable errors of all cameras are than one camera at fault."""
         return float(chdtri(2, RIVAL)) if self.scale != 1.0 else 0.0
 
+    @property
+    def margin(self) -> float:
+        """By how much it must be better than another one: chi-square of what is free, six parameters at most."""
+        n = int(self.free.sum()) + (self.common is not None)
+        is_of_few = n > 0 and self.scale == 1.0 and not self.robots
+        return float(chdtri(min(n, CAUSES["pose"].stop) if is_of_few else CAUSES["pose"].stop, FALSE_ALARM))
+
     def is_part_of(self, other: "Hypothesis") -> bool:
         """Whether the other one frees all that this one does."""
-        is_free = (self.free <= other.free).all() and self.has_other_size <= other.has_other_size
+        is_free = (self.free <= other.free).all() and self.common in (None, other.common)
         return bool(is_free) and self.scale in (1.0, other.scale) and set(self.robots) <= set(other.robots)
 
     def n_free(self, window: Window) -> int:
@@ -172,7 +183,12 @@ class Hypothesis:
         n_places = 3 * int(
             np.isin(window.owner, self.robots).sum()
         )  # of which a pose of each robot is not determined
-        return int(self.free.sum()) + self.has_other_size + n_places - CAUSES["pose"].stop * len(self.robots)
+        return (
+            int(self.free.sum())
+            + (self.common is not None)
+            + n_places
+            - CAUSES["pose"].stop * len(self.robots)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -359,13 +375,14 @@ def judge(window: Window, starts: Array, moved: Sequence[int] = ()) -> Verdict:
     """
     n = len(window.names)
     none = fit(window, Hypothesis.of(None, (), n))
-    if not is_contradicted(none, n, 1.0):
+    in_common = np.stack([sigma * window.common(of) for of, sigma in COMMON_SIGMA.items()], axis=1)
+    if not is_contradicted(none, in_common, 1.0):
         return Verdict(None, (), none, scale=_most_likely_scale(window, none))
     everything = fit(
         window, replace(Hypothesis.of(None, range(n), n, starts), robots=several_markers(window))
     )
     scale = _most_likely_scale(window, everything)
-    if not is_contradicted(none, n, everything.noise(window)):
+    if not is_contradicted(none, in_common, everything.noise(window)):
         return Verdict(None, (), none, scale=scale)
     if not everything.is_adequate():  # nor is any other hypothesis
         return Verdict(None, tuple(range(n)), everything, none.misfit, scale)
@@ -378,9 +395,10 @@ def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Seq
     if moved:
         return decide([*as_stated, fit(window, Hypothesis.of("pose", moved, n, starts))], seeing, moved)
     fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in seeing]
-    other_size = replace(as_stated[0].hypothesis, cause="wand", has_other_size=True)
-    fits += [fit(window, Hypothesis.of("focal", seeing, n)), fit(window, other_size)]
-    all_shapes = fit(window, replace(as_stated[0].hypothesis, cause="shape", robots=several_markers(window)))
+    none = as_stated[0].hypothesis
+    fits.append(fit(window, replace(none, cause="focal", cameras=tuple(seeing), common="focal")))
+    fits.append(fit(window, replace(none, cause="wand", common="size")))
+    all_shapes = fit(window, replace(none, cause="shape", robots=several_markers(window)))
     suspected = _displaced_most(window, all_shapes)
     fits += [all_shapes, *(fit(window, replace(all_shapes.hypothesis, robots=(r,))) for r in suspected)]
     if len(seeing) > MIN_FOR_PAIRS:
@@ -424,20 +442,35 @@ def _allowed(S: Array, A: Array) -> float:
     return float(np.linalg.slogdet(np.eye(len(S)) + S @ A)[1])
 
 
-def is_contradicted(none: Fit, n_cameras: int, variance: float) -> bool:
+def explained(P: Array, H: Array, y: Array, G: Array, sigma: float) -> tuple[Array, Array]:
+    """(K,) how much less keyframes cost if errors are free along one of the columns of G (8 C, K) alone, with a
+    standard deviation `sigma`, and (K,) the errors along it: a rank-one change of the covariance P (8 C, 8 C) of the
+    cameras' errors, of which the keyframes show H e = y."""
+    with_them = np.linalg.solve(np.eye(len(y)) + H @ P, np.column_stack([y, H @ G]))
+    score, information = G.T @ with_them[:, 0], np.einsum("ik,ik->k", G, with_them[:, 1:]) + sigma**-2
+    return score**2 / information, score / information
+
+
+def is_contradicted(none: Fit, in_common: Array, variance: float) -> bool:
     """Whether errors of the cameras explain more than chance, with those that the prior held back: the score test (Rao
     1948) of all of them together, and how far the prior was stretched. With A the information of the window and x its
-    estimate, the sum is x^T (A^-1 + S)^-1 x, chi-square if the errors have the covariance S of the prior.
+    estimate, the sum is x^T (A^-1 + S)^-1 x, chi-square if the errors have the covariance S of the prior. What all
+    cameras have in common is one parameter, and hides among so many: it has a test of its own.
 
     Args:
         none: the fit without a fault.
-        n_cameras: of the rig.
+        in_common: (8 C, K) errors of all cameras by K parameters that all have in common, in their standard deviations.
         variance: of whitened residuals, as of a model that explains all that errors of the cameras can: the residuals
             of `none` contain the fault.
     """
     score = _score(none.reduced)
     stretched = none.errors.ravel() @ none.prior @ none.errors.ravel()
-    return bool(score + stretched > variance * chdtri(ERRORS * n_cameras, FALSE_ALARM))
+    if score + stretched > variance * chdtri(none.errors.size, FALSE_ALARM):
+        return True
+    H, g = none.reduced[:, :-1] / variance, none.reduced[:, -1] / variance
+    stated = np.asarray(np.linalg.inv(none.prior), float)
+    gains, _ = explained(stated, H, g + H @ none.errors.ravel(), in_common, 1.0)
+    return bool(gains.max() > chdtri(1, FALSE_ALARM))
 
 
 def has_changed(window: Window, found: Fit, keyframes: Mask) -> bool:
@@ -480,7 +513,7 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
     variance = min(f.variance for f in fits)
     score = {id(f): f.cost / variance + f.penalty + f.hypothesis.odds for f in fits}
     best = min(fits, key=lambda f: score[id(f)])
-    limit = score[id(best)] + chdtri(CAUSES["pose"].stop, FALSE_ALARM)
+    limit = score[id(best)] + best.hypothesis.margin
     rivals = [
         f
         for f in fits
@@ -490,7 +523,7 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
         and (not best.hypothesis.odds or 2 * len(f.hypothesis.cameras) < len(seeing))
     ]
     explanations = best, *rivals
-    size = next((f.size for f in explanations if f.hypothesis.has_other_size), 0.0)
+    size = next((f.size for f in explanations if f.hypothesis.common == "size"), 0.0)
     cause, cameras = best.hypothesis.cause, best.hypothesis.cameras
     is_of_few = cause == "focal" or 2 * len(cameras) < len(seeing)
     if not rivals and (is_of_few or cameras == tuple(moved)):
@@ -530,7 +563,8 @@ def fit(window: Window, hypothesis: Hypothesis, max_iterations: int = MAX_ITERAT
         stated, larger = (_allowed(window.covariance(s), reduced[:, :-1]) for s in (1.0, hypothesis.scale))
         penalty += np.log(2 * len(at.squared)) + larger - stated
     found = at.errors, at.bodies, at.places, priors.cameras
-    size = float(at.errors.ravel() @ window.growth / (window.growth @ window.growth))
+    growth = window.common("size")
+    size = float(at.errors.ravel() @ growth / (growth @ growth))
     reduced_to = reduced, by_marker, of_places
     return Fit(hypothesis, at.cost, penalty, *found, *reduced_to, at.rows, at.squared, size)
 
@@ -549,8 +583,9 @@ class _Priors:
         held = ~hypothesis.free.ravel()
         covariance = window.covariance(hypothesis.scale) * np.outer(held, held)
         covariance += np.diag((hypothesis.free * FREE_SIGMA**2).ravel())
-        if hypothesis.has_other_size:
-            covariance += WAND_SIGMA**2 * np.outer(window.growth, window.growth)
+        if hypothesis.common is not None:
+            of_all = COMMON_SIGMA[hypothesis.common] * window.common(hypothesis.common)
+            covariance += np.outer(of_all, of_all)
         rotation, position = POSE_SIGMA
         bodies = np.tile([rotation**-2.0] * 3 + [position**-2.0] * 3 + [0.0] * 6, (len(window.states), 1))
         bodies[:, OMEGA] = (window.velocity_sigma[:, 0] ** -2)[:, None]

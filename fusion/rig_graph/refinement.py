@@ -65,6 +65,7 @@ class Refinement:
         self._own = _own_covariance(given, self._metrics)
         self.x, self.P = np.zeros(len(since)), self._prior
         self._t_ns = self._n_refused = 0
+        self._n_windows = 0.0  # that count
         self._freed = set[int]()  # cameras that changed, and are not corrected yet
 
     @property
@@ -77,10 +78,11 @@ class Refinement:
             self.P = self.P + (scale**2 - self._scale**2) * self._stated
             self._scale = scale
 
-    def free_lens(self, k: int) -> None:
-        """The focal length of a camera is another one."""
-        row = ERRORS * k + CAUSES["focal"].start
-        self.P[row, row] += FREE_SIGMA[CAUSES["focal"]][0] ** 2
+    def free_lenses(self, cameras: Sequence[int]) -> None:
+        """The focal length of a camera is another one, or those of several are, in common."""
+        together = np.zeros(len(self.x))
+        together[ERRORS * np.array(cameras) + CAUSES["focal"].start] = FREE_SIGMA[CAUSES["focal"]][0]
+        self.P = self.P + np.outer(together, together)
 
     def _free(self, k: int) -> None:
         """The pose or the lens of a camera is another one."""
@@ -88,12 +90,21 @@ class Refinement:
         self.P[np.ix_(rows, rows)] += (GATES_PX[-1] / USUAL_PX) ** 2 * self._own[np.ix_(rows, rows)]
         self._freed.add(k)
 
-    def update(self, t_ns: int, H: Array, y: Array) -> None:
-        """Add keyframes: least squares H e = y, (8 C, 8 C) and (8 C,), about the errors at their mean time."""
+    def update(self, t_ns: int, H: Array, y: Array, offsets: Array, of_clocks: Array) -> None:
+        """Add keyframes.
+
+        Args:
+            t_ns: their mean time.
+            H, y: (8 C, 8 C) and (8 C,) least squares H e = y about the errors.
+            offsets, of_clocks: (C,) of the clocks, and their covariance (C, C): what is left of them looks like poses,
+                and is the same in all windows, so it counts as many times.
+        """
         self._wander(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
-        self._t_ns, identity = t_ns, np.eye(len(y))
-        with_own = np.linalg.inv(identity + H @ self._own)
-        H, y = with_own @ H, with_own @ y
+        self._t_ns, identity, clocks = t_ns, np.eye(len(y)), np.flatnonzero(~np.tile(OF_IMAGE, len(offsets)))
+        own = self._own.copy()
+        own[np.ix_(clocks, clocks)] += self._n_windows * of_clocks
+        with_own = np.linalg.inv(identity + H @ own)
+        H, y = with_own @ H, with_own @ (y - H[:, clocks] @ offsets)
         if not self._agrees(H, y - H @ self.x):
             self._n_refused += 1
             if self._n_refused >= CONFIRMED:
@@ -108,6 +119,7 @@ class Refinement:
     def _wander(self, dt: float) -> None:
         """An Ornstein-Uhlenbeck process about the rig in use."""
         decay = np.exp(-dt / MEMORY_S)
+        self._n_windows = 1 + decay**2 * self._n_windows
         self.x, self.P = decay * self.x, decay**2 * self.P + (1 - decay**2) * self._prior
 
     def _agrees(self, H: Array, off: Array) -> bool:
@@ -147,12 +159,12 @@ class Refinement:
 
     @property
     def is_significant(self) -> bool:
-        """Whether a camera is off by more than the rig states and windows have of their own, and none so far that its
-        markers were mistaken; of a camera that changed, by more than is uncertain yet."""
-        off_px, least = self.off_px, LARGE * np.maximum(self._image_px(self._stated), USUAL_PX)
-        freed = sorted(self._freed)
-        is_known = (off_px > LARGE * self._image_px(self.P))[freed].all()
-        return bool((off_px > least).any() and (off_px < GATES_PX[-1]).all() and is_known)
+        """Whether a camera is off by more than the rig states, windows have of their own and is uncertain yet, as each
+        camera that changed is, and none so far that its markers were mistaken."""
+        off_px, usual = self.off_px, np.maximum(self._image_px(self._stated), USUAL_PX)
+        is_known = off_px > LARGE * self._image_px(self.P)
+        is_off = (is_known & (off_px > LARGE * usual)).any()
+        return bool(is_off and (off_px < GATES_PX[-1]).all() and is_known[sorted(self._freed)].all())
 
     def _image_px(self, covariance: Array) -> Array:
         return np.sqrt(np.einsum("kij,kij->k", own_blocks(covariance), self._metrics))

@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from camera_node.foundation.arrays import Array
 from fusion.model.marker_places import PLACE_M, frame_covariance, motions
 from fusion.model.observations import MarkerTable
-from fusion.rig_graph.hypotheses import FALSE_ALARM, FREE_SHAPE_M, WAND_SIGMA
+from fusion.rig_graph.hypotheses import COMMON_SIGMA, FALSE_ALARM, FREE_SHAPE_M
 
 Equations = tuple[Array, Array]  # H (3 m, 3 m) and y (3 m,) of H p = y, about displacements p of m markers
 TOLERANCES_M = np.array([PLACE_M * 2.0**k for k in range(7)])  # of markers that are measured less well
@@ -158,7 +158,7 @@ def _of_any_frame_and_size(places: Array, H: Array, y: Array) -> Equations:
     and by what a linearization neglects. It is little, so that no window contradicts those before by it.
     """
     G = np.column_stack([motions(places), places.ravel()])
-    HG, information = H @ G, np.diag([ANY_MOTION**-2] * 6 + [WAND_SIGMA**-2])
+    HG, information = H @ G, np.diag([ANY_MOTION**-2] * 6 + [COMMON_SIGMA["size"] ** -2])
     eliminated = np.linalg.solve(information + G.T @ HG, np.column_stack([HG.T, G.T @ y]))
     return H - HG @ eliminated[:, :-1], y - HG @ eliminated[:, -1]
 

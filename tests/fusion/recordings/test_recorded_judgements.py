@@ -54,14 +54,20 @@ def test_a_replay_takes_judgements_when_the_server_took_them():
 
 
 def test_recordings_repeat_how_well_the_times_of_frames_are_known():
-    """Those of older servers state no errors of single stamps."""
-    (before, _), errors = moved(2.0, 0.0), {"clock_sigma_s": 2e-3, "stamp_sigma_s": 3e-3}
+    """And when they arrived, by which clocks are judged. Those of older servers state neither this nor the errors of
+    single stamps."""
+    (before, _), errors = (
+        moved(2.0, 0.0),
+        {"clock_sigma_s": 2e-3, "stamp_sigma_s": 3e-3, "received_ns": 10**18},
+    )
     frames = tuple(replace(frame, **errors) for frame in before.frames(1))
     message = FusedFrames.of(FrameSet(frames[0].t_ns, frames), 0)
-    for recorded, stamp_sigma_s in (
-        (message, 3e-3),
-        (msgspec.structs.replace(message, stamp_sigmas=b""), 0.0),
+    for recorded, received_ns, stamp_sigma_s in (
+        (message, 10**18, 3e-3),
+        (msgspec.structs.replace(message, stamp_sigmas=b"", arrivals=b""), 0, 0.0),
     ):
         again = decode(encode(recorded), FusedFrames)
         again.check()
-        assert again.rows() == [(f.camera, f.stamp_ns, f.t_ns, 2e-3, stamp_sigma_s) for f in frames]
+        assert again.rows() == [
+            (f.camera, f.stamp_ns, f.t_ns, received_ns, 2e-3, stamp_sigma_s) for f in frames
+        ]

@@ -151,6 +151,53 @@ def test_a_clock_that_departs_leaves_those_certain_that_were_corrected_before():
     assert max(d.rate_sigma for d in others) < RATE_SIGMA
 
 
+@pytest.mark.parametrize("sigma", [1e-4, 2e-4])
+def test_a_clock_departs_by_arrivals_where_robots_hardly_show_it(sigma: float):
+    """One robot before three cameras: keyframes show offsets to 10 ms, so 2000 ppm were not seen in ten seconds."""
+    found, deviations = [], []
+    for seed in range(20):
+        rng, walk = np.random.default_rng(seed), ClockWalk(3)
+        for k in range(10):
+            t_ns, offsets = START_NS + k * 10**9, np.array([0.0, -2e-3 * k, 0.0])
+            for camera in range(3 if k else 0):
+                walk.hear(t_ns, camera, (-2e-3 if camera == 1 else 0.0) + sigma * rng.normal(), sigma)
+            H, y = about_offsets(offsets + 1e-2 * rng.normal(size=3))
+            walk.update(t_ns, H * (SIGMA_S / 1e-2) ** 2, y * (SIGMA_S / 1e-2) ** 2)
+            if departures := walk.take_departures():
+                found.append((k, departures[0]))
+                break
+    assert [departure.camera for _, departure in found] == [1] * 20
+    assert max(k for k, _ in found) < 6
+    deviations = [(d.offset_s + 2e-3 * k) / d.sigma_s for k, d in found]
+    assert np.mean(np.square(deviations)) < 2.3  # chi-square with 20 degrees of freedom, one in a thousand
+
+
+def test_a_rate_that_may_be_of_a_delay_is_counted_and_not_believed():
+    walk, now_ns = settled(4)
+    for seconds in range(3):
+        for camera in range(4):
+            walk.hear(now_ns + seconds * 10**9, camera, 0.0, 1e-4)
+    walk.hear(now_ns + 3 * 10**9, 2, 3e-3, np.inf)
+    walk.listen(now_ns + 3 * 10**9)
+    sigma = np.sqrt(np.diag(walk.P)[walk.rates])
+    assert np.abs(walk.x).max() < 1e-12
+    assert sigma[2] == pytest.approx(3e-3)
+    assert np.delete(sigma, 2).max() < 2e-4
+
+
+def test_corrected_stamps_have_another_rate():
+    """Arrivals that wait for keyframes show the rate of the stamps as they were: it is corrected in the meantime."""
+    walk, now_ns = settled(4, 2)
+    walk.departed = [2]
+    walk.hear(now_ns, 2, -1e-3, 1e-4)
+    walk.update(now_ns, *about_offsets(np.zeros(4)))
+    walk.hear(now_ns + 10**9, 2, -1e-3, 1e-4)
+    (found,) = (d for d in walk.take_departures() if d.camera == 2)
+    assert found.rate < -2e-4
+    walk.listen(now_ns + 10**9)
+    assert walk.x[walk.rates[2]] > -1e-3
+
+
 def test_two_clocks_do_not_show_which_one_departs():
     assert first_departure([2e-4, 0.0], 1) is None
 

@@ -178,7 +178,22 @@ def test_errors_far_beyond_their_prior_are_contradicted(sigmas: float, contradic
     none = fitted(None, (), 3, 0.0)
     errors = none.errors.copy()
     errors[1, 7] = sigmas
-    assert is_contradicted(replace(none, errors=errors), 3, 1.0) == contradicts
+    assert is_contradicted(replace(none, errors=errors), np.zeros((24, 1)), 1.0) == contradicts
+
+
+@pytest.mark.parametrize(("sigmas", "contradicts"), [(4.0, False), (6.0, True)])
+def test_what_all_cameras_have_in_common_is_contradicted_within_chance_of_all_errors(
+    sigmas: float, contradicts: bool
+):
+    """Each of 12 focal lengths is off by 1.2 or 1.7 of its standard deviations, all in the same direction."""
+    is_focal = np.tile(np.arange(ERRORS) == 7, 12).astype(float)
+    signs = np.tile(np.repeat([1.0, -1.0], ERRORS), 6)
+    none, H = fitted(None, (), 12, 0.0), 100.0 * np.diag(is_focal)
+    for off, shows in ((is_focal, contradicts), (is_focal * signs, False)):
+        errors = sigmas / np.sqrt(12) * off
+        found = errors * 100 / 101  # held back by the prior
+        at = replace(none, errors=found.reshape(12, -1), reduced=np.column_stack([H, H @ (errors - found)]))
+        assert is_contradicted(at, 100.0 * is_focal[:, None], 1.0) == shows
 
 
 def test_the_camera_is_named_that_explains_more_than_every_other():

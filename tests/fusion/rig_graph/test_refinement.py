@@ -42,7 +42,10 @@ class Windows:
     def show(self, refinement: Refinement, errors: np.ndarray, k: int) -> None:
         """Window k, of errors (8 C,)."""
         noise = self._root @ self._rng.normal(size=len(errors))
-        refinement.update(START_NS + k * WINDOW_NS, self._H, self._H @ errors + noise)
+        n = len(errors) // ERRORS
+        refinement.update(
+            START_NS + k * WINDOW_NS, self._H, self._H @ errors + noise, np.zeros(n), np.zeros((n, n))
+        )
 
 
 def since(n: int) -> np.ndarray:
@@ -148,6 +151,29 @@ def test_a_clock_or_one_of_three_cameras_changes_no_pose():
         windows.show(refinement, truth, 7)
         assert not refinement.is_significant
         assert (np.diag(refinement.P) < 1.5 * before).all()  # 1.42 as they wander; none is free
+
+
+@pytest.mark.parametrize(("sigma_s", "least", "most"), [(0.0, 2e-4, 4e-4), (2e-2, 0.0, 5e-5)])
+def test_what_a_clock_may_explain_is_no_pose(sigma_s: float, least: float, most: float):
+    """Windows show a turn and an offset of one camera only together, by the way robots move: 0.3 mrad or 3 ms."""
+    cameras, seen = ring(4), np.zeros(4 * ERRORS)
+    seen[0], seen[6] = 1.0, 0.1
+    H = np.outer(seen, seen) / 2e-5**2
+    refinement = Refinement(cameras, since(4))
+    refinement.widen(4.0)
+    for k in range(6):
+        of_clocks = sigma_s**2 * np.eye(4)
+        refinement.update(START_NS + k * WINDOW_NS, H, 3e-4 * H[:, 0], np.zeros(4), of_clocks)
+    assert least <= refinement.x[0] <= most
+
+
+def test_an_offset_that_is_known_is_no_pose():
+    cameras, seen = ring(4), np.zeros(4 * ERRORS)
+    seen[0], seen[6] = 1.0, 0.1
+    H, refinement = np.outer(seen, seen) / 2e-5**2, Refinement(cameras, since(4))
+    offsets = np.array([3e-3, 0.0, 0.0, 0.0])
+    refinement.update(START_NS, H, 3e-4 * H[:, 0], offsets, np.zeros((4, 4)))
+    assert np.abs(refinement.x).max() < 1e-9
 
 
 def test_a_pinned_camera_is_not_corrected_and_its_errors_stay_known():
