@@ -21,6 +21,9 @@ def unpack_detections(
 ) -> NDArray[
     np.float64
 ]: ...  # (14 N,) the columns of `protocol.messages.Detections`, covariances with 4 numbers
+def quaternions(
+    rotations: NDArray[np.float64],
+) -> NDArray[np.float64]: ...  # (N, 4) of (N, 3, 3), see `geometry.pose.wxyz_from_rotation`
 def distance_by_principal_axis(diameter: float, major: float) -> float: ...
 def disc_pictures(
     position: NDArray[np.float64], normal: NDArray[np.float64]

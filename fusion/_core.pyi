@@ -100,6 +100,9 @@ class BodyFit:
     def centres(self) -> tuple[Array, Array, Array]:
         """The last equations of the centres (N, 2, 13), their weights (N,) and whitened residuals (N, 2)."""
 
+def whiten(cov: Array, scale: Array, /) -> Array:
+    """(2, 2, N) L^-1 scale of N detections, where L L^T is the covariance; cov and scale (2, 2, N)."""
+
 def squared_px(errors: Array, cov: Array, whiten: Array, /) -> Array:
     """(N,) squared lengths in pixels of whitened errors (N, 2): cov, whiten (2, 2, N); NaN where `whiten` is."""
 
@@ -107,17 +110,17 @@ class DetectionColumns:
     """N detections sorted by frame."""
 
     def __init__(
-        self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, delay: Array, /
+        self, frame: Index, xy: Array, scale: Array, cov: Array, major: Array, code: Array, delay: Array, /
     ) -> None:
-        """Frame, major and delay (N,), s after the frame; xy (2, N), scale and cov (2, 2, N)."""
+        """Frame, major, code (-1 for none) and delay (N,), s after the frame; xy (2, N), scale and cov (2, 2, N)."""
 
 class ExpectedMarkers:
     """M markers of tracked bodies, with the covariances of their positions."""
 
     def __init__(
-        self, R: Array, P: Array, body: Index, position: Array, normal: Array, radius: Array, /
+        self, R: Array, P: Array, body: Index, code: Index, position: Array, normal: Array, radius: Array, /
     ) -> None:
-        """R (B, 3, 3) and P (B, 12, 12) by body; body, radius (M,), position and normal (3, M) by marker."""
+        """R (B, 3, 3) and P (B, 12, 12) by body; body, code, radius (M,), position and normal (3, M) by marker."""
 
     def covariances(self, tau: float, /) -> Array:
         """(M, 3, 3) covariances of world positions, tau seconds after the time of the states."""
@@ -129,6 +132,21 @@ class ExpectedMarkers:
 
         focal (F,) pixels, by frame.
         """
+
+def marker_states(
+    bodies: BodyStates, P: Array, body: Index, position: Array, normal: Array, /
+) -> tuple[Array, Array]:
+    """(3, K, 3) positions, velocities and normals of K markers in the world, and position covariances (K, 3, 3).
+
+    P (B, 12, 12) of the bodies; by marker its body (K,), position and normal (3, K).
+    """
+
+def assign(pairs: Index, cost: Array, frame: Index, /) -> Index:
+    """As many as possible of the pairs (2, K) of markers and detections in each frame at the lowest total cost (K,),
+    each marker and detection once: their columns, ascending.
+
+    frame (N,) of the detections; pairs in the order of frames, then of markers.
+    """
 
 def labelings(
     first: Index,
@@ -277,23 +295,30 @@ def consider(P: Array, counted: Array, responses: Array, factor: Array, /) -> Ar
     factor (8 C, 8 C): P without the part that counts these as noise. See `respond`.
     """
 
-def log_ratios(
+def are_own(
     A: Array,
     nu: Array,
-    other: Array,
+    cov: Array,
+    log_density: Array,
     body: Index,
     camera: Index,
     certain: NDArray[np.bool_],
-    P: Array,
+    information: Array,
     of_body: Index,
     of_camera: Index,
+    turn: Index,
+    prior: Array,
+    added_px2: Array,
     /,
-) -> Array:
-    """(K,) log-likelihoods of the assignments of K bodies in a camera each, -1 for any, that are not certain, given
-    those that are, minus that as any roundels of their images.
+) -> NDArray[np.bool_]:
+    """(N,) the assignments that are certain, or more probable as those of their bodies than as any roundels of their
+    images.
 
-    By assignment: whitened derivatives A (N, 2, 12), innovations nu (N, 2), logarithm of the density `other` (N,), body
-    and camera (N,), certain (N,); P (B, 12, 12) of the predictions.
+    By assignment: whitened derivatives A (N, 2, 12), innovations nu (N, 2), covariances of the centres (2, 2, N), px^2,
+    logarithm of the density of roundels (N,), 1/px^2, body and camera (N,), certain (N,). Information (B, 12, 12) of
+    the predictions. By doubt: a body, a camera or -1 for any, its turn, ascending, the logarithm of how probable the
+    uncertain assignments are before, and a variance beside their noise (K,). Each is judged given the assignments that
+    are certain, and those that were accepted in the turns before.
     """
 
 def inverses(information: Array, /) -> Array:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from camera_node import _core
 from camera_node.foundation.arrays import Array
 
 
@@ -52,17 +53,8 @@ def wxyz_from_rotation(R: ArrayLike) -> Array:
 
     Divides by the largest component (Shepperd 1978).
     """
-    R = np.asarray(R, float)
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(R.reshape(-1, 3, 3), 0, 2)
-    trace = xx + yy + zz
-    w, x, y, z = squares = 1 + np.array(
-        [trace, 2 * xx - trace, 2 * yy - trace, 2 * zz - trace]
-    )  # 4 w^2 to 4 z^2
-    a, b, c, d, e, f = zy - yz, xz - zx, yx - xy, yx + xy, xz + zx, zy + yz
-    rows = np.array([[w, a, b, c], [a, x, d, e], [b, d, y, f], [c, e, f, z]])
-    q = rows[np.argmax(squares, axis=0), :, np.arange(len(trace))]
-    q = np.where(q[:, :1] < 0, -1.0, 1.0) * q / np.linalg.norm(q, axis=1, keepdims=True)
-    return q.reshape(*R.shape[:-2], 4)
+    R = np.ascontiguousarray(R, float)
+    return _core.quaternions(R.reshape(-1, 3, 3)).reshape(*R.shape[:-2], 4)
 
 
 def rotation_from_vector(vectors: ArrayLike) -> Array:

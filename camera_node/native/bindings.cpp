@@ -9,6 +9,7 @@
 #include "code/code_book.hpp"
 #include "detector.hpp"
 #include "frame_columns.hpp"
+#include "numeric/quaternion.hpp"
 
 namespace nb = nanobind;
 using GreyImage = nb::ndarray<const uint8_t, nb::ndim<2>, nb::device::cpu>;
@@ -71,9 +72,21 @@ static nb::object explain(roundel::Detector& detector, const GreyImage& image) {
     return array(rows, rings.size(), {9});
 }
 
+/// (N, 4) quaternions of N rotations.
+static nb::object quaternions(const nb::ndarray<const double, nb::shape<-1, 3, 3>, nb::c_contig>& rotations) {
+    std::vector<double> parts;
+    for (size_t k = 0; k < rotations.shape(0); ++k) {
+        const double* m = rotations.data() + 9 * k;
+        const auto q = roundel::quaternion({{m[0], m[1], m[2]}, {m[3], m[4], m[5]}, {m[6], m[7], m[8]}});
+        parts.insert(parts.end(), q.begin(), q.end());
+    }
+    return array(parts, rotations.shape(0), {4});
+}
+
 NB_MODULE(_core, m) {
     bind_lens(m);
     bind_messages(m);
+    m.def("quaternions", &quaternions);
     m.attr("CODE_SECTORS") = roundel::kCodeSectors;
     m.attr("CODE_RADII") = nb::make_tuple(roundel::kCodeInner, roundel::kCodeOuter);
     m.def("code_words", [] { return roundel::code_words(); });

@@ -133,6 +133,7 @@ class CameraArray:
         R_cam_world: (C, 3, 3).
         centres: (C, 3) centres of projection, world frame.
         focal: (C,) mean focal lengths, pixels.
+        area_px2: (C,) of the images.
         covariance: (8 C, 8 C) of the errors of the cameras, which claims contain; see `calib.rig.camera_errors`.
         error_px: (C,) what these errors displace in the images, RMS of a coordinate, at most `MAX_ERROR_PX`: by these,
             detections are weighed, associated and searched.
@@ -189,6 +190,7 @@ class CameraArray:
         self.R_cam_world = np.ascontiguousarray(T[:, :3, :3].transpose(0, 2, 1))
         self.centres = np.ascontiguousarray(T[:, :3, 3])
         self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
+        self.area_px2 = np.array([camera.width * camera.height for camera in cameras], float)
         of_size = self.size_error * errors_of_size(T)
         self.covariance = self.error_scale**2 * error_covariance(list(cameras)) + np.outer(of_size, of_size)
         self.error_px = np.minimum(image_errors(list(cameras), self.covariance), MAX_ERROR_PX)
@@ -292,14 +294,6 @@ class DetectionTable(Columns):
         """The same with a variance added to both coordinates of all centres, px^2."""
         return self.replaced(COV, self.cov + added_px2 * np.eye(2)[:, :, None]) if added_px2 else self
 
-    def may_be(self, rows: Index, codes: Index) -> Mask:
-        """(K,) whether detections (rows) may be markers with these codes: all that have no name, or that one.
-
-        A name is certain to 1e-6. Twice the negative logarithm of that is above the gates of association, so that a
-        detection is no marker of another name.
-        """
-        return (self.code[rows] < 0) | (self.code[rows] == codes)
-
     @property
     def camera(self) -> Index:
         """(N,) index of the camera."""
@@ -318,7 +312,8 @@ class DetectionTable(Columns):
     @property
     def native(self) -> _core.DetectionColumns:
         """The arrays for the native core."""
-        return _core.DetectionColumns(self.frame, self.xy, self.scale, self.cov, self.axes_px[0], self.delay)
+        rows = self.axes_px[0], self.columns[CODE], self.delay
+        return _core.DetectionColumns(self.frame, self.xy, self.scale, self.cov, *rows)
 
     def conics(self) -> Array:
         """(N, 3, 3) conics Q of outlines, p^T Q p = 0 for undistorted p = (x, y, 1); NaN where the axes are unknown.
@@ -420,7 +415,7 @@ class MarkerTable(Columns):
         Without `body`, the rows of the states are those of the robots.
         """
         body = self.robot[rows] if body is None else body
-        return _core.ExpectedMarkers(states.R, states.P, body, *self._shapes(rows))
+        return _core.ExpectedMarkers(states.R, states.P, body, self.code[rows], *self._shapes(rows))
 
     def _shapes(self, rows: Index) -> tuple[Array, Array, Array]:
         return self.position.take(rows, 1), self.normal.take(rows, 1), self.radius[rows]
@@ -473,7 +468,8 @@ class MatchedObservations(Columns):
     @classmethod
     def of_discs(cls, detections: DetectionTable, discs: Discs) -> "MatchedObservations":
         """Detections of known discs, row by row, each captured when the detection was."""
-        return cls(replace(discs, delay=detections.delay), detections, _whiten(detections))
+        whiten = _core.whiten(detections.cov, detections.scale)
+        return cls(replace(discs, delay=detections.delay), detections, whiten)
 
     def with_bodies(self, body: Index) -> "MatchedObservations":
         """The same of other bodies (N,), as of several states of one robot."""
@@ -486,20 +482,10 @@ class MatchedObservations(Columns):
         return np.where(np.isnan(d2), np.inf, d2)
 
 
-def _whiten(detections: DetectionTable) -> Array:
-    """L^-1 scale, where L L^T is the covariance of the detection."""
-    a = np.sqrt(detections.cov[0, 0])
-    b = detections.cov[0, 1] / a
-    c = np.sqrt(detections.cov[1, 1] - b * b)
-    first = detections.scale[0] / a
-    return np.stack([first, (detections.scale[1] - b * first) / c])
-
-
 def detection_density(cameras: CameraArray, detections: DetectionTable, frame: Index) -> Array:
     """(F,) detections per pixel^2 in each frame, of those in the frames (K,)."""
-    lenses = [cameras[cameras.names[k]] for k in detections.exposures.camera.tolist()]
-    counts = np.bincount(frame, minlength=len(lenses))
-    return counts / np.array([lens.width * lens.height for lens in lenses], float)
+    area_px2 = cameras.area_px2[detections.exposures.camera]
+    return np.bincount(frame, minlength=len(area_px2)) / area_px2
 
 
 def mean_by_body(values: NDArray, body: Index, n_bodies: int) -> Array:

@@ -37,6 +37,12 @@ struct Displacement {
     int a, b;
 };
 
+constexpr int kTheta = 0, kPosition = 3, kOmega = 6, kVelocity = 9;
+
+Displacement displacement_by_pose(const Vector& position, const Matrix& R) {
+    return {R * minus_skew(position), kTheta, kPosition};
+}
+
 Matrix cross_covariance(const double* P, const Displacement& u, const Displacement& v) {
     const Matrix A_T = transposed(v.A);
     return (u.A * block(P, u.a, v.a) + block(P, u.b, v.a)) * A_T + u.A * block(P, u.a, v.b) +
@@ -164,12 +170,21 @@ double cost(const ExpectedView& expected, const Detection& detection, const Dete
 
 }  // namespace
 
-ExpectedMarker ExpectedMarker::of(int64_t body, const DiscOnBody& disc, const Matrix& R, const double* P) {
-    constexpr int kTheta = 0, kPosition = 3, kOmega = 6, kVelocity = 9;
-    const Displacement by_pose{R * minus_skew(disc.position), kTheta, kPosition};
+Matrix position_covariance(const Vector& position, const Matrix& R, const double* P) {
+    const Displacement by_pose = displacement_by_pose(position, R);
+    return cross_covariance(P, by_pose, by_pose);
+}
+
+ExpectedMarker ExpectedMarker::of(int64_t body, int64_t code, const DiscOnBody& disc, const Matrix& R,
+                                  const double* P) {
+    const Displacement by_pose = displacement_by_pose(disc.position, R);
     const Displacement by_rates{minus_skew(R * disc.position), kOmega, kVelocity};
     const Matrix both = cross_covariance(P, by_pose, by_rates);
-    return {body, disc, cross_covariance(P, by_pose, by_pose), both + transposed(both),
+    return {body,
+            code,
+            disc,
+            cross_covariance(P, by_pose, by_pose),
+            both + transposed(both),
             cross_covariance(P, by_rates, by_rates)};
 }
 
@@ -201,6 +216,8 @@ std::vector<Candidate> find_candidates(const FramePoses& poses, const ExpectedMa
                 const ExpectedView expected = expect(markers.all()[m], poses.at(f, group.body), exposure);
                 if (!(expected.at.facing() > kGrazing) || !std::isfinite(expected.at.x)) continue;
                 of_frame.visit_near(expected, [&](const Detection& d) {
+                    const double code = detections.code[d.index];
+                    if (code >= 0 && code != double(markers.all()[m].code)) return;
                     const double value = cost(expected, d, detections, focal[f]);
                     if (std::isfinite(value)) found.push_back({int64_t(m), d.index, value});
                 });

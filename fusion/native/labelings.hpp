@@ -6,7 +6,7 @@
 
 namespace roundel::fusion {
 
-/// Pairs of markers and detections by ascending marker, and what each costs.
+/// Pairs of markers and detections, and what each costs.
 struct MarkerPairs {
     const int64_t *marker, *detection;
     const double* cost;
@@ -24,7 +24,8 @@ struct LabelingLimits {
     size_t steps, labelings;
 };
 
-/// Finds the labelings of `least` pairs or more that cost less than `most`, depth first by marker.
+/// Finds the labelings of pairs by ascending marker: those of `least` pairs or more that cost less than
+/// `most`, depth first by marker.
 std::vector<Labeling> find_labelings(const MarkerPairs& pairs, int64_t least, double most,
                                      const LabelingLimits& limits);
 

@@ -124,17 +124,43 @@ void residuals(const EquationSystem& system, const double* steps, double* to) {
                 residual(system.equations[k].A[a], steps + kErrors * system.body[k]);
 }
 
-double log_ratio(const Evidence& evidence, int64_t body, int64_t camera, const ErrorMatrix& P) {
-    // With L = P^-1 + A^T A and b = A^T nu of any assignments, det(A P A^T + I) = det P det L, and
-    // nu^T (A P A^T + I)^-1 nu = nu^T nu - b^T L^-1 b.
-    ErrorMatrix L = inverse(P);
+namespace {
+
+/// The equations of an assignment with more noise: with L L^T its covariance, and L' L'^T that with the
+/// noise, L'^-1 L times those whitened by L^-1.
+struct NoisyEquations {
+    ErrorVector A[2];
+    double nu[2], log_area;
+
+    NoisyEquations(const Evidence& evidence, size_t k, double added_px2) {
+        const Columns<4>& cov = evidence.cov;
+        const double uu = cov.at(0, k), uv = cov.at(1, k), vv = cov.at(3, k);
+        const double a = std::sqrt(uu), b = uv / a, c = std::sqrt(vv - b * b);
+        const double a_now = std::sqrt(uu + added_px2), b_now = uv / a_now;
+        const double c_now = std::sqrt(vv + added_px2 - b_now * b_now);
+        log_area = std::log(a_now * c_now);
+        const auto whiten = [&](double x, double y, double& u, double& v) {
+            u = a / a_now * x;
+            v = (b * x + c * y - b_now * u) / c_now;
+        };
+        for (int i = 0; i < kErrors; ++i) whiten(evidence.A[k][0][i], evidence.A[k][1][i], A[0][i], A[1][i]);
+        whiten(evidence.nu[k][0], evidence.nu[k][1], nu[0], nu[1]);
+    }
+};
+
+/// The log-likelihood of the uncertain assignments `rows` given the certain ones and the prediction, minus
+/// that as any roundels of their images.
+double log_ratio(const Evidence& evidence, const std::vector<size_t>& certain,
+                 const std::vector<size_t>& rows, double added_px2, const ErrorMatrix& information) {
+    // With the information L = P^-1 + A^T A and b = A^T nu of any assignments, det(A P A^T + I) = det P det
+    // L, and nu^T (A P A^T + I)^-1 nu = nu^T nu - b^T L^-1 b.
+    ErrorMatrix L = information;
     ErrorVector b{};
-    double ratio = 0;
-    const auto add = [&](size_t k) {
+    const auto add = [&](const NoisyEquations& equations) {
         for (int a = 0; a < 2; ++a)
             for (int i = 0; i < kErrors; ++i) {
-                b[i] += evidence.A[k][a][i] * evidence.nu[k][a];
-                for (int j = 0; j <= i; ++j) L[i][j] += evidence.A[k][a][i] * evidence.A[k][a][j];
+                b[i] += equations.A[a][i] * equations.nu[a];
+                for (int j = 0; j <= i; ++j) L[i][j] += equations.A[a][i] * equations.A[a][j];
             }
     };
     const auto explained = [&] {
@@ -142,17 +168,38 @@ double log_ratio(const Evidence& evidence, int64_t body, int64_t camera, const E
         const ErrorVector z = factor.halfway(b);
         return std::inner_product(z.begin(), z.end(), z.begin(), 0.0) / 2 - factor.log_determinant() / 2;
     };
-    for (size_t k = 0; k < evidence.count; ++k)
-        if (evidence.body[k] == body && evidence.certain[k]) add(k);
-    ratio -= explained();
-    for (size_t k = 0; k < evidence.count; ++k) {
-        if (evidence.body[k] != body || evidence.certain[k]) continue;
-        if (camera >= 0 && evidence.camera[k] != camera) continue;
-        add(k);
-        const double x = evidence.nu[k][0], y = evidence.nu[k][1];
-        ratio -= (x * x + y * y) / 2 + std::log(2 * std::numbers::pi) + evidence.other[k];
+    for (const size_t k : certain) add(NoisyEquations(evidence, k, added_px2));
+    double ratio = -explained();
+    for (const size_t k : rows) {
+        const NoisyEquations equations(evidence, k, added_px2);
+        add(equations);
+        const double x = equations.nu[0], y = equations.nu[1];
+        ratio -= (x * x + y * y) / 2 + std::log(2 * std::numbers::pi);
+        ratio -= equations.log_area + evidence.log_density[k];
     }
     return ratio + explained();
+}
+
+}  // namespace
+
+void accept(const Evidence& evidence, const Doubts& doubts, const ErrorMatrix* information, bool* certain) {
+    std::vector<size_t> accepted;
+    for (size_t d = 0; d < doubts.n; ++d) {
+        const int64_t body = doubts.body[d], camera = doubts.camera[d];
+        std::vector<size_t> beside, rows;
+        for (size_t k = 0; k < evidence.cov.n; ++k) {
+            if (evidence.body[k] != body) continue;
+            if (certain[k])
+                beside.push_back(k);
+            else if (camera < 0 || evidence.camera[k] == camera)
+                rows.push_back(k);
+        }
+        const double ratio = log_ratio(evidence, beside, rows, doubts.added_px2[d], information[body]);
+        if (doubts.prior[d] + ratio > 0) accepted.insert(accepted.end(), rows.begin(), rows.end());
+        if (d + 1 < doubts.n && doubts.turn[d + 1] == doubts.turn[d]) continue;
+        for (const size_t k : accepted) certain[k] = true;
+        accepted.clear();
+    }
 }
 
 std::optional<ErrorMatrix> inverse_if_positive(const ErrorMatrix& H) {

@@ -41,20 +41,28 @@ void reweigh(const EquationSystem& system, ErrorMatrix* H, ErrorVector* g, doubl
 /// Writes 2 x N whitened residuals b - A delta of the steps delta (K x 12).
 void residuals(const EquationSystem& system, const double* steps, double* to);
 
-/// N linearized assignments: whitened derivatives and innovations, the logarithm of the density of other
-/// roundels, the body and the camera, and whether it is certain.
+/// N linearized assignments: whitened derivatives and innovations, the covariances of the centres (pixels^2),
+/// the logarithm of the density of other roundels (per pixel^2), the body and the camera.
 struct Evidence {
     const double (*A)[2][kErrors];
     const double (*nu)[2];
-    const double* other;
+    Columns<4> cov;
+    const double* log_density;
     const int64_t *body, *camera;
-    const bool* certain;
-    size_t count;
 };
 
-/// The log-likelihood of the assignments of a body in a camera, or in any (-1), that are not certain, given
-/// those that are and the covariance P of its prediction, minus that as any roundels of their images.
-double log_ratio(const Evidence& evidence, int64_t body, int64_t camera, const ErrorMatrix& P);
+/// K doubts whether the assignments of a body in a camera, or in any (-1), are its own: the logarithm of how
+/// probable that is before, and the variance of both coordinates beside their own noise, pixels^2. Those of
+/// one turn follow each other, and are judged given what was accepted in the turns before.
+struct Doubts {
+    const int64_t *body, *camera, *turn;
+    const double *prior, *added_px2;
+    size_t n;
+};
+
+/// Marks the assignments as certain that are more probable as the body's own than as any roundels of their
+/// images, given those that are certain and the information of the predictions, by body.
+void accept(const Evidence& evidence, const Doubts& doubts, const ErrorMatrix* information, bool* certain);
 
 /// The inverse of a positive definite matrix.
 std::optional<ErrorMatrix> inverse_if_positive(const ErrorMatrix& H);

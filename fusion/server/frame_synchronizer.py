@@ -2,7 +2,7 @@
 """Gathers the frames of free-running cameras into frame sets. Time comes from the data and the caller, not a clock."""
 
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median_low
@@ -127,12 +127,24 @@ class FrameSynchronizer:
             return []
         return self._close(lambda end_ns: self._is_due(end_ns, now_ns), SILENT_NS)
 
-    def open(self) -> tuple[FrameSet | None, int]:
-        """The frames of the next set that have arrived (None without any), and how many are missing."""
+    @property
+    def open_ns(self) -> int | None:
+        """The time of the next frame set; None before its first frame."""
         if self._end_ns is None or not self.period_ns or not self._waiting:
-            return None, 0
+            return None
+        return self._end_ns - self.period_ns // 2
+
+    def opened(self, n_used: int, worth: int) -> FrameSet | None:
+        """The frames of the next set that have arrived, if `worth` times as many as are missing are new: not `n_used`.
+
+        With most messages the number of frames that wait decides it.
+        """
+        if self._end_ns is None or not self.period_ns or len(self._waiting) - n_used < worth:
+            return None
+        if not (n_missing := sum(1 for _ in self._missing_until(self._end_ns))):
+            return None
         opened = self._gather(self._end_ns, self.period_ns)
-        return (opened if opened.frames else None), self._count_missing(self._end_ns)
+        return opened if len(opened.frames) - n_used >= worth * n_missing else None
 
     def finish(self) -> list[FrameSet]:
         """The frame sets of all remaining frames, at the end of a recording."""
@@ -230,7 +242,7 @@ class FrameSynchronizer:
         """Whether the wait limit is reached, or all live cameras have delivered to a set that has begun."""
         has_begun = self.period_ns is not None and now_ns >= end_ns - self.period_ns
         is_complete = has_begun and any(self._is_live(c) for c in self._cameras.values())
-        if is_complete and not self._count_missing(end_ns):
+        if is_complete and next(self._missing_until(end_ns), None) is None:
             return True
         if (
             now_ns < end_ns + self.lateness_ns
@@ -245,9 +257,9 @@ class FrameSynchronizer:
         else:
             self._missing.pop(name, None)
 
-    def _count_missing(self, end_ns: int) -> int:
-        """How many live cameras have not delivered a frame that is expected before `end_ns`."""
+    def _missing_until(self, end_ns: int) -> Iterator[_CameraRate]:
+        """The live cameras that have not delivered a frame that is expected before `end_ns`."""
         if end_ns != self._missing_end_ns:
             self._missing_end_ns = end_ns
             self._missing = {name: c for name, c in self._cameras.items() if c.is_missing(end_ns)}
-        return sum(map(self._is_live, self._missing.values()))
+        return filter(self._is_live, self._missing.values())

@@ -24,7 +24,7 @@ from fusion.server.server_statistics import PipelineStatus
 from fusion.server.storage.active_rig import ActiveRig, renamed
 from fusion.server.storage.active_robots import ActiveRobots
 from fusion.tracking.association import AssociatedFrames
-from fusion.tracking.tracker import Tracker
+from fusion.tracking.tracker import WORTH, Tracker
 
 log = logging.getLogger("fusion")
 
@@ -238,10 +238,11 @@ class TrackingPipeline:
             self.tracker.monitors.rig.executor = executor
 
     def associate_early(self) -> None:
-        """Associate the frames of the open frame set while the last ones are missing."""
-        frame_set, n_missing = self.synchronizer.open()
-        if self.tracker is not None and frame_set is not None:
-            self.early = self.tracker.associate_early(frame_set, n_missing, self.early)
+        """Associate the frames of the open frame set while the last ones are missing: of eight frames, after six."""
+        if self.tracker is not None and (t_ns := self.synchronizer.open_ns) is not None:
+            self.early = self.tracker.predict(t_ns, self.early)
+            opened = self.synchronizer.opened(self.early.association.n_frames, WORTH)
+            self.early = self.tracker.associate(self.early, opened) if opened else self.early
 
     def admit(self, frame: CalibratedFrame) -> CalibratedFrame | None:
         """A frame in corrected time; None while its camera is withheld, or if it is in the future."""

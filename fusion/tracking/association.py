@@ -23,8 +23,9 @@ another's: there its view of the robot is judged given what the other cameras se
 what it usually sees elsewhere, all by one turn, was moved: what it still shows near the predictions is not theirs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -41,7 +42,6 @@ from fusion.model.observations import (
     detection_density,
 )
 from fusion.model.states import POSITION, VELOCITY, States
-from fusion.tracking.assignment import assign
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.labelings import MISSED, Labelings, find_labelings
 from fusion.tracking.rays import GATE
@@ -49,14 +49,19 @@ from fusion.tracking.rays import GATE
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _AssignedFrames:
-    """Frames that were assigned together: for each assignment the frame, the detection in it, and the marker; and the
-    other labelings of robots that are hardly less probable, with their detections in their frames."""
+    """Frames that were assigned together: for each detection its row of the marker table or -1, by frame; and the other
+    labelings of robots that are hardly less probable."""
 
     frames: tuple[CalibratedFrame, ...]
-    frame: Index
-    detection: Index
     marker: Index
     labelings: Labelings
+
+    def by_frame(self) -> Iterator[tuple[int, Index]]:
+        """Of each frame its identity, and the rows of the marker table of its detections."""
+        last = 0
+        for frame in self.frames:
+            first, last = last, last + frame.columns.shape[1]
+            yield id(frame), self.marker[first:last]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +109,11 @@ class Association:
         expected = marker_table.expected(rows, states)
         return cls(cameras, cameras.revision, marker_table, states, rows, expected, t_ns)
 
+    @property
+    def n_frames(self) -> int:
+        """How many frames are assigned."""
+        return sum(len(part.frames) for part in self.parts)
+
     def is_of(self, t_ns: int, cameras: CameraArray, marker_table: MarkerTable) -> bool:
         """Whether this is of the frame set at `t_ns`, of these markers, and of the present poses of the cameras."""
         return self.t_ns == t_ns and self.marker_table is marker_table and self.revision == cameras.revision
@@ -119,50 +129,47 @@ class Association:
         if not new:
             return self
         detections = DetectionTable.of(FrameSet(self.t_ns, new), self.cameras)
-        detection, marker, labelings = self._assign(detections)
-        frame, first = detections.frame[detection], _first_rows(new)
-        local = replace(labelings, detection=labelings.detection - first[labelings.frame[labelings.number]])
-        part = _AssignedFrames(new, frame, detection - first[frame], marker, local)
+        part = _AssignedFrames(new, *self._assign(detections))
         return replace(self, parts=(*self.parts, part))
 
     def collect(self, frame_set: FrameSet) -> tuple[DetectionTable, Assignments, Labelings]:
-        """All detections of the frame set, its assignments in the order of the detections, and other labelings that
-        are hardly less probable."""
+        """All detections of a frame set whose frames are assigned, its assignments in the order of the detections, and
+        other labelings that are hardly less probable."""
         detections = DetectionTable.of(frame_set, self.cameras)
-        number = {id(frame): k for k, frame in enumerate(frame_set.frames)}
-        first = np.append(_first_rows(frame_set.frames), 0)
-        marker_of = np.full(len(detections), -1)
-        labelings = list[Labelings]()
-        for part in self.parts:
-            frame = np.array([number.get(id(one), -1) for one in part.frames], np.intp)  # -1: not in the set
-            used = frame[part.frame] >= 0
-            marker_of[first[frame[part.frame[used]]] + part.detection[used]] = part.marker[used]
-            if len(part.labelings):
-                others = part.labelings.select(frame[part.labelings.frame] >= 0)
-                at = frame[others.frame]
-                rows = others.detection + first[at[others.number]]
-                labelings.append(replace(others, frame=at, detection=rows))
+        assigned = dict(chain.from_iterable(part.by_frame() for part in self.parts))
+        of_none = np.empty(0, np.intp)
+        marker_of = np.concatenate([of_none, *(assigned[id(frame)] for frame in frame_set.frames)])
         detection = np.flatnonzero(marker_of >= 0)
-        return (
-            detections,
-            Assignments.of(detection, marker_of[detection]),
-            Labelings.none().joined(*labelings),
-        )
+        return detections, Assignments.of(detection, marker_of[detection]), self._labelings(frame_set.frames)
 
-    def _assign(self, detections: DetectionTable) -> tuple[Index, Index, Labelings]:
-        """Rows of the detections and of the marker table, and other labelings."""
+    def _labelings(self, frames: Sequence[CalibratedFrame]) -> Labelings:
+        """Those of all parts, with the rows of these frames and of their detections."""
+        parts, found = [part for part in self.parts if len(part.labelings)], list[Labelings]()
+        if not parts:
+            return Labelings.none()
+        number, first = {id(frame): k for k, frame in enumerate(frames)}, np.append(_first_rows(frames), 0)
+        for part in parts:
+            at = np.array(
+                [number.get(id(frame), -1) for frame in part.frames], np.intp
+            )  # -1: not one of these
+            others = part.labelings.select(at[part.labelings.frame] >= 0)
+            rows = others.detection + (first[at] - _first_rows(part.frames))[others.frame[others.number]]
+            found.append(replace(others, frame=at[others.frame], detection=rows))
+        return Labelings.none().joined(*found)
+
+    def _assign(self, detections: DetectionTable) -> tuple[Index, Labelings]:
+        """(N,) the row of the marker table of each detection, -1 for none, and other labelings."""
         exposures = detections.exposures
         poses = self.cameras.frame_poses(self.states, exposures)
         focal = self.cameras.focal[exposures.camera]
         pairs, cost = self.expected.candidates(poses, detections.native, focal)
-        possible = detections.may_be(pairs[1], self.marker_table.code[self.markers[pairs[0]]])
-        pairs, cost = pairs[:, possible], cost[possible]
-        robot = self.marker_table.robot[self.markers[pairs[0]]]
-        chosen = assign(pairs, cost, detections.frame)
-        rows = np.stack([self.markers[pairs[0]], pairs[1]])
-        labelings = find_labelings(self.cameras, detections, rows, cost, robot, chosen)
-        marker, detection = rows[:, chosen]
-        return detection, marker, labelings
+        chosen = _core.assign(pairs, cost, detections.frame)
+        pairs[0] = self.markers[pairs[0]]
+        robot = self.marker_table.robot[pairs[0]]
+        labelings = find_labelings(self.cameras, detections, pairs, cost, robot, chosen)
+        marker = np.full(len(detections), -1)
+        marker[pairs[1, chosen]] = pairs[0, chosen]
+        return marker, labelings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,13 +192,13 @@ class AssignedFrames:
     """Frames of a frame set with their assignments before the update.
 
     Attributes:
-        states: predicted robots.
+        prediction: of all robots.
         tracked: (R,) robots whose detections were assigned.
         detections: of all frames.
         assignments: of the detections.
     """
 
-    states: States
+    prediction: Prediction
     tracked: Mask
     detections: DetectionTable
     assignments: Assignments
@@ -199,25 +206,19 @@ class AssignedFrames:
 
 def _first_rows(frames: Sequence[CalibratedFrame]) -> Index:
     """The row of each frame's first detection in a detection table."""
-    return np.cumsum([0, *(len(frame.roundels) for frame in frames)])[:-1]
+    return np.cumsum([0, *(frame.columns.shape[1] for frame in frames)])[:-1]
 
 
 LEARNED = 8  # frames of a camera that define the usual number of detections of a robot
 # Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
 CHANGED = np.log(0.02)
 CLUTTERED = np.exp(CHANGED)  # other roundels expected in a gate: as probable there as what is judged anyway
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Doubts:
-    """Robots of which much is missing (R,), what that costs (R,), and views (R, C) with the logarithm of how probable
-    they are before they are seen, and the variance of their detections beside their own noise, px^2."""
-
-    fallen: Mask
-    cost: Array
-    views: Mask
-    prior: float
-    noise_px2: float = 0.0
+# Sums over the diagonals of these blocks of a covariance, for all robots at once: of its numbers (144,).
+BLOCKS = (POSITION, POSITION), (POSITION, VELOCITY), (VELOCITY, VELOCITY)
+TRACES = np.zeros((12, 12, len(BLOCKS)))
+for _k, (_a, _b) in enumerate(BLOCKS):
+    TRACES[_a, _b, _k] = np.eye(3)
+TRACES = TRACES.reshape(-1, len(BLOCKS))
 
 
 class OwnDetections:
@@ -268,15 +269,8 @@ class OwnDetections:
         partial = present & ~unseen & ~cluttered & ((missing > count) | self._shows_few(given, count))
         doubtful = unseen | cluttered | partial
         own = ~(fallen[robot] | doubtful.ravel()[view] | displaced[view % self._shape[1]])
-        # What a camera did not see before is judged given all that others see.
-        no_robots = np.zeros_like(fallen)
-        for doubts in (
-            _Doubts(fallen, cost, cluttered, 0.0),
-            _Doubts(no_robots, cost, partial, 0.0, noise_px2),
-            _Doubts(no_robots, cost, unseen, CHANGED),
-        ):
-            if doubts.fallen.any() or doubts.views.any():
-                own[self._accepted(given, view, own, doubts)] = True
+        prior = cost[fallen] - CHANGED
+        own = self._accepted(given, view, own, (fallen, prior), (cluttered, partial, unseen), noise_px2)
         self._learn(self._count(view[own]), frames, given.tracked)
         return own
 
@@ -288,15 +282,19 @@ class OwnDetections:
         for k in np.flatnonzero(first.any(0)).tolist():
             tau = float(exposures.tau[exposures.camera == k][-1])
             markers = self._markers, np.flatnonzero(first[self._markers.robot, k])
-            expected = ExpectedViews.of(self._cameras, self._cameras.names[k], given.states, tau, markers)
+            expected = ExpectedViews.of(
+                self._cameras, self._cameras.names[k], given.prediction.states, tau, markers
+            )
             facing = np.bincount(self._markers.robot[expected.rows], minlength=self._shape[0])
             found[:, k] = first[:, k] & (facing > 2 * count[:, k])
         return found
 
     def _cluttered(self, given: AssignedFrames) -> Mask:
         """(R, C) views in which other roundels are expected in the gate of a marker, as wide as that of its robot."""
-        found, seen, states = np.zeros(self._shape, bool), given.detections, given.states
-        others = np.delete(seen.frame, given.assignments.detection)
+        found, seen, states = np.zeros(self._shape, bool), given.detections, given.prediction.states
+        is_other = np.ones(len(seen), bool)
+        is_other[given.assignments.detection] = False
+        others = seen.frame[is_other]
         if not len(others):
             return found
         density = detection_density(self._cameras, seen, others)
@@ -308,45 +306,54 @@ class OwnDetections:
     def _variance_px2(self, states: States, seen: DetectionTable) -> Array:
         """(R, F) of a coordinate of the predicted images of robots in each frame, px^2, by their positions."""
         camera, tau = seen.exposures.camera, seen.exposures.tau
-        of_p, of_both, of_v = (
-            np.einsum("nii->n", states.P[:, a, b])[:, None]
-            for a, b in ((POSITION, POSITION), (POSITION, VELOCITY), (VELOCITY, VELOCITY))
-        )
+        of_p, of_both, of_v = (states.P.reshape(-1, 12 * 12) @ TRACES).T[:, :, None]
         variance = (of_p + 2 * tau * of_both + tau**2 * of_v) / 3
-        squared_m2 = np.sum((states.p[:, None] - self._cameras.centres[camera]) ** 2, axis=2)
+        off = states.p[:, None] - self._cameras.centres[camera]
+        squared_m2 = np.einsum("rfi,rfi->rf", off, off)
         return np.asarray(self._cameras.focal[camera] ** 2 * variance / squared_m2, float)
 
-    def _accepted(self, given: AssignedFrames, view: Index, certain: Mask, doubts: _Doubts) -> Index:
-        """The uncertain assignments that are more probable as those of their robot.
+    def _accepted(
+        self,
+        given: AssignedFrames,
+        view: Index,
+        certain: Mask,
+        fallen: tuple[Mask, Array],
+        views: tuple[Mask, Mask, Mask],
+        noise_px2: float,
+    ) -> Mask:
+        """(N,) the certain assignments, and those that are more probable as those of their robots.
 
         Args:
             given: N assignments of a frame set.
             view: (N,) of the assignments, robot and camera.
             certain: (N,) assignments that are not to be judged.
-            doubts: the robots and views whose assignments are uncertain.
+            fallen: (R,) robots of which much is missing, and the logarithm of how probable the rest of each is.
+            views: (R, C) those in clutter, those that show few, and those that were not seen before.
+            noise_px2: see `are_own`; of the views that show few.
         """
         n_cameras = self._shape[1]
-        rows = np.flatnonzero((doubts.fallen | doubts.views.any(1))[view // n_cameras])
+        robots, asked = np.flatnonzero(fallen[0]), [np.nonzero(of_kind) for of_kind in views]
+        of_robot = np.concatenate([robots, *(robot for robot, _ in asked)])
+        if not len(of_robot):
+            return certain
+        of_camera = np.concatenate([np.full(len(robots), -1), *(camera for _, camera in asked)])
+        # What a camera did not see before is judged given all that others see.
+        turn = np.repeat([0, 0, 1, 2], [len(robots), *(len(robot) for robot, _ in asked)])
+        prior, added_px2 = np.where(turn == 2, CHANGED, 0.0), np.where(turn == 1, noise_px2, 0.0)
+        prior[: len(robots)] = fallen[1]
+        is_asked = np.zeros(self._shape[0], bool)
+        is_asked[of_robot] = True
+        rows = np.flatnonzero(is_asked[view // n_cameras])
         robot, camera = np.divmod(view[rows], n_cameras)
-        noisy = given.detections.with_noise(doubts.noise_px2)
-        observations = MatchedObservations.of(given.assignments.select(rows), noisy, self._markers)
-        A, nu = self._estimator.innovations(given.states, observations)
-        cov, frame = observations.detections.cov, observations.detections.frame
-        # The density of other roundels, of pixels instead of whitened centres.
-        log_area = 0.5 * np.log(cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2)
-        other = log_area + np.log(
-            detection_density(self._cameras, given.detections, given.detections.frame)[frame]
-        )
-        fallen, (seen, by) = np.flatnonzero(doubts.fallen), np.nonzero(doubts.views)
-        of_robot, of_camera = np.concatenate([fallen, seen]), np.concatenate([np.full(len(fallen), -1), by])
-        prior = np.concatenate([doubts.cost[fallen] - CHANGED, np.full(len(seen), doubts.prior)])
-        evidence = A.reshape(-1, 2, 12), nu.reshape(-1, 2), other, robot, camera, certain[rows]
-        ratio = _core.log_ratios(*evidence, given.states.P, of_robot, of_camera)
-        accepted = np.zeros(self._shape, bool)
-        is_own = prior + ratio > 0
-        accepted[fallen] = is_own[: len(fallen), None]
-        accepted[seen, by] = is_own[len(fallen) :]
-        return rows[accepted[robot, camera] & ~certain[rows]]
+        observations = MatchedObservations.of(given.assignments.select(rows), given.detections, self._markers)
+        A, nu = self._estimator.innovations(given.prediction.states, observations)
+        density = detection_density(self._cameras, given.detections, given.detections.frame)
+        seen = observations.detections.cov, np.log(density[observations.detections.frame]), robot, camera
+        doubts = of_robot, of_camera, turn, prior, added_px2
+        evidence = A.reshape(-1, 2, 12), nu.reshape(-1, 2), *seen, certain[rows], given.prediction.information
+        own = certain.copy()
+        own[rows] = _core.are_own(*evidence, *doubts)
+        return own
 
     def _find_displaced(self, given: AssignedFrames, count: Index, missing: Array) -> Mask:
         """(C,) the cameras in which most markers that they usually show are elsewhere, all by one turn, while another
@@ -373,11 +380,13 @@ class OwnDetections:
         of their predictions: fewer are assigned within these where a frame has several labelings."""
         name, seen = self._cameras.names[camera], given.detections
         frames = np.flatnonzero(seen.exposures.camera == camera)
-        scene = self._cameras, name, given.states
+        scene = self._cameras, name, given.prediction.states
         expected = [ExpectedViews.of(*scene, seen.exposures.tau[k], (self._markers, rows)) for k in frames]
         detected = [seen.uv[:, seen.frame == k].T for k in frames]
         pairs = match_moved(self._cameras[name], expected, detected, TURNED)[1]
-        gate_px2 = GATE * (self._variance_px2(given.states, seen) + self._cameras.error_px[camera] ** 2)
+        gate_px2 = GATE * (
+            self._variance_px2(given.prediction.states, seen) + self._cameras.error_px[camera] ** 2
+        )
         n = 0
         for k, views, uv, (shown, there) in zip(frames, expected, detected, pairs, strict=True):
             off_px2 = np.sum((uv[there] - views.uv[shown]) ** 2, axis=1)
@@ -391,7 +400,7 @@ class OwnDetections:
     def _learn(self, count: Index, frames: Index, expected: Mask) -> None:
         """Adapt the usual numbers of expected robots in the cameras that sent frames; forget those of others."""
         known = expected[:, None] & (frames > 0)
-        for column in (self._usual, self._learned, self._unseen):
+        for column in () if expected.all() else (self._usual, self._learned, self._unseen):
             column[~expected] = 0
         self._unseen = np.where(known, count == 0, self._unseen)
         self._learned += known

@@ -113,7 +113,7 @@ class Estimator:
             return BodyFit(states, np.empty(0), np.zeros(len(states)), np.empty((0, 2, 13)), np.empty(0))
         sigma = 2 * np.hypot(AXIS_SIGMA_PX, 2 * np.sqrt(seen.cov[0, 0])) / seen.axes_px[1]
         turned = read_headings(observations)
-        with_headings, headings = observations.select(turned), np.empty((0, 2, 13))
+        with_headings, headings = observations.select(turned) if turned.any() else None, np.empty((0, 2, 13))
         fit = _core.BodyFit(
             states.bodies,
             self.cameras.exposed(seen.exposures),
@@ -130,7 +130,7 @@ class Estimator:
             prediction.information,
         )
         for _ in range(MAX_ITERATIONS):
-            if len(with_headings):
+            if with_headings is not None:
                 headings = linearize_headings(self.cameras, _estimates(fit, states.P), with_headings)
             if not fit.step(_eliminate(*fit.linearize(headings)), small):
                 break

@@ -194,10 +194,8 @@ def markers_message(
         detections: of the frame set.
     """
     rows = np.flatnonzero(marker_cameras.any(1))
-    states, none = table.states, np.full(len(unlabeled.markers), -1)
-    owner = table.markers.robot[rows]
-    omega, (arm, covariance) = states.omega[owner], table.marker_positions(rows)
-    by_rotation = omega[:, [1, 2, 0]] * arm[:, [2, 0, 1]] - omega[:, [2, 0, 1]] * arm[:, [1, 2, 0]]
+    none = np.full(len(unlabeled.markers), -1)
+    (position, velocity, normal), covariance = table.marker_states(rows)
     no_candidates = np.full((len(rows), 2, 3), np.nan)
     codes, zeros = read_codes(cameras, detections, unlabeled.markers, unlabeled.normal)
     bits = np.array([_bits(marker.cameras) for marker in unlabeled.markers], np.uint64)
@@ -205,16 +203,16 @@ def markers_message(
         t_ns=t_ns,
         robots=table.names,
         camera_names=cameras.names,
-        position=_column("<f8", states.p[owner] + arm, unlabeled.position),
+        position=_column("<f8", position, unlabeled.position),
         covariance=_column("<f4", covariance, unlabeled.covariance),
-        normal=_column("<f4", table.marker_normals(rows), unlabeled.normal),
-        velocity=_column("<f4", states.v[owner] + by_rotation, unlabeled.velocity),
+        normal=_column("<f4", normal, unlabeled.normal),
+        velocity=_column("<f4", velocity, unlabeled.velocity),
         diameter=_column(
             "<f4", np.full(len(rows), np.nan), np.array([m.diameter_m for m in unlabeled.markers])
         ),
         code=_column("<i4", np.zeros(len(rows)), codes),
         zero=_column("<f4", np.full((len(rows), 3), np.nan), zeros),
-        robot=_column("<i4", owner, none),
+        robot=_column("<i4", table.markers.robot[rows], none),
         marker=_column("<i4", table.markers.number[rows], none),
         candidates=_column("<f4", no_candidates, unlabeled.candidates),
         cameras=_column("<u8", _packed(marker_cameras[rows]), bits),

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from fusion import _core
 from fusion.model.limits import Limits
 from fusion.model.observations import Assignments, MarkerTable
 from fusion.model.robots import Robot
@@ -191,22 +192,17 @@ class TrackTable:
         for k in rows.tolist():
             self.status[k] = "lost"
 
-    def marker_positions(self, rows: Index) -> tuple[Array, Array]:
-        """Of markers `rows`: arms (K, 3) from the robot's origin and position covariances (K, 3, 3), world frame."""
-        owner, positions = self.markers.robot[rows], self.markers.position.take(rows, 1)
-        claimed = replace(self.states, P=self.claimed)
-        covariances = self.markers.expected(rows, claimed).covariances(0.0)
-        return np.einsum("nij,jn->ni", self.states.R[owner], positions), covariances
-
-    def marker_normals(self, rows: Index) -> Array:
-        """(K, 3) unit normals of markers `rows`, world frame."""
-        return np.einsum("nij,jn->ni", self.states.R[self.markers.robot[rows]], self.markers.normal[:, rows])
+    def marker_states(self, rows: Index) -> tuple[Array, Array]:
+        """Of markers `rows`, world frame: positions, velocities and normals (3, K, 3), and position covariances (K, 3,
+        3)."""
+        markers = self.markers
+        shapes = markers.position.take(rows, 1), markers.normal.take(rows, 1)
+        return _core.marker_states(self.states.bodies, self.claimed, markers.robot[rows], *shapes)
 
     def alive_markers(self) -> tuple[Array, Array]:
         """Positions (K, 3) and covariances (K, 3, 3) of all markers of tracked and coasting robots."""
-        rows = np.flatnonzero(self.alive[self.markers.robot])
-        arms, covariances = self.marker_positions(rows)
-        return self.states.p[self.markers.robot[rows]] + arms, covariances
+        vectors, covariances = self.marker_states(np.flatnonzero(self.alive[self.markers.robot]))
+        return vectors[0], covariances
 
     def receive(self, zone: str, states: ZoneStates) -> None:
         """Take the states of another zone's robots with the next prediction after their time."""

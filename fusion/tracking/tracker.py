@@ -41,7 +41,9 @@ from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
 
 log = logging.getLogger("fusion")
-WORTH = 3  # frames that cost as much as their association, which is repeated for each late one
+# Frames that cost as much as their association, which is repeated for each late one: the frames that have arrived are
+# associated early when they are so many times as many as the missing ones.
+WORTH = 3
 PAUSED = "no robot is acquired while the wand is recorded"
 
 
@@ -148,22 +150,6 @@ class Tracker:
         frames = self._used(frame_set).frames
         return replace(associated, association=associated.association.extended(frames))
 
-    def associate_early(
-        self, frame_set: FrameSet, n_missing: int, early: AssociatedFrames | None
-    ) -> AssociatedFrames:
-        """Associate the frames that have arrived, while `n_missing` frames of the set have not.
-
-        It is done when `WORTH` times as many frames are pending as missing: of eight frames, after six.
-
-        Args:
-            frame_set: the frames that have arrived.
-            n_missing: how many have not.
-            early: the last return value.
-        """
-        associated = self.predict(frame_set.t_ns, early)
-        pending = associated.association.pending(self._used(frame_set).frames)
-        return self.associate(associated, frame_set) if len(pending) >= WORTH * n_missing > 0 else associated
-
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
         t_ns, tracked = frame_set.t_ns, associated.tracked
@@ -254,8 +240,7 @@ class Tracker:
         return {self.table.names[k]: self._reasons.get(k, default) for k in missing}
 
     def _used(self, frame_set: FrameSet) -> FrameSet:
-        is_known = not any(frame.time_sigma_s for frame in frame_set.frames)
-        return self.monitors.used(frame_set, 0.0 if is_known else self.table.speed_m_s)
+        return self.monitors.used(frame_set, lambda: self.table.speed_m_s)
 
     def _claim(self) -> None:
         """State the covariances of the robots with the errors of the cameras."""
@@ -278,7 +263,7 @@ class Tracker:
     ) -> Assignments:
         """Update the states of the robots; returns the assignments that fit, with residuals."""
         prediction, tracked = associated.prediction, associated.tracked
-        given = AssignedFrames(prediction.states, tracked, detections, assignments)
+        given = AssignedFrames(prediction, tracked, detections, assignments)
         own = assignments.select(self.own.are_own(given, self.robust.noise_px2))
         fitted = self.robust.update(prediction, needed, detections, own)
         self.table.states = fitted.states

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.foundation.arrays import Array, Index, Mask
+from fusion import _core
 from fusion.model.observations import (
     Assignments,
     CameraArray,
@@ -23,7 +24,6 @@ from fusion.model.observations import (
     mean_by_body,
 )
 from fusion.model.states import OMEGA, VELOCITY, States
-from fusion.tracking.assignment import assign
 from fusion.tracking.constellation_search import Fits
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.gating import (
@@ -82,9 +82,7 @@ def _detected(
     expected = markers.expected(rows, state, np.zeros(len(rows), np.intp))
     poses, focal = cameras.frame_poses(state, exposures), cameras.focal[exposures.camera]
     pairs, cost = expected.candidates(poses, detections.native, focal)
-    possible = detections.may_be(pairs[1], markers.code[rows[pairs[0]]])
-    pairs, cost = pairs[:, possible], cost[possible]
-    marker, detection = pairs[:, assign(pairs, cost, detections.frame)]
+    marker, detection = pairs[:, _core.assign(pairs, cost, detections.frame)]
     detected = np.zeros((len(rows), len(exposures.camera)), bool)
     detected[marker, detections.frame[detection]] = True
     return detected

@@ -30,7 +30,7 @@ from fusion.server.ingest import Ingest
 from fusion.server.server import MAX_LAG_NS, collecting_between_frame_sets
 from fusion.server.server_statistics import PipelineStatus, ServerStatistics
 from fusion.tracking.association import AssociatedFrames
-from fusion.tracking.tracker import Tracker, Update
+from fusion.tracking.tracker import WORTH, Tracker, Update
 from tests.benchmarks.fusion_load import Load
 
 T = TypeVar("T")
@@ -190,9 +190,11 @@ class Queue:
         return self.tracker.update(associated, frame_set)
 
     def _associate_early(self) -> None:
-        frame_set, n_missing = self.synchronizer.open()
-        if frame_set is not None:
-            self._early = self.tracker.associate_early(frame_set, n_missing, self._early)
+        """As `TrackingPipeline` does."""
+        if (t_ns := self.synchronizer.open_ns) is not None:
+            self._early = self.tracker.predict(t_ns, self._early)
+            opened = self.synchronizer.opened(self._early.association.n_frames, WORTH)
+            self._early = self.tracker.associate(self._early, opened) if opened else self._early
 
     def _add(self, data: bytes, key: str, arrival_ns: int) -> None:
         """As `Server` does."""

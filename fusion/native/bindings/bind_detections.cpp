@@ -4,6 +4,7 @@
 #include <algorithm>
 
 #include "arrays.hpp"
+#include "assignment.hpp"
 #include "candidates.hpp"
 #include "inverse_lens.hpp"
 #include "labelings.hpp"
@@ -16,32 +17,34 @@ struct DetectionColumns {
     Index frame;
     Pairs xy;
     Matrices2 scale, cov;
-    Numbers major, delay;
+    Numbers major, code, delay;
 
     DetectionColumns(const Index& frames, const Pairs& xys, const Matrices2& scales, const Matrices2& covs,
-                     const Numbers& majors, const Numbers& delays)
-        : frame(frames), xy(xys), scale(scales), cov(covs), major(majors), delay(delays) {
-        require_equal(frame.size(), {xy.shape(1), scale.shape(2), cov.shape(2), major.size(), delay.size()});
+                     const Numbers& majors, const Numbers& codes, const Numbers& delays)
+        : frame(frames), xy(xys), scale(scales), cov(covs), major(majors), code(codes), delay(delays) {
+        require_equal(frame.size(),
+                      {xy.shape(1), scale.shape(2), cov.shape(2), major.size(), code.size(), delay.size()});
     }
 
     Detections view() const {
         const size_t n = frame.size();
-        return {frame.data(),       columns<2>(xy, n), columns<4>(scale, n),
-                columns<4>(cov, n), major.data(),      delay.data()};
+        return {frame.data(), columns<2>(xy, n), columns<4>(scale, n), columns<4>(cov, n),
+                major.data(), code.data(),       delay.data()};
     }
 };
 
-/// R and P are by body; `body`, `position`, `normal` and `radius` are by marker.
+/// R and P are by body; `body`, `code`, `position`, `normal` and `radius` are by marker.
 void make_expected(ExpectedMarkers* self, const Rotations& R, const Covariances& P, const Index& body,
-                   const Vectors& position, const Vectors& normal, const Numbers& radius) {
+                   const Index& code, const Vectors& position, const Vectors& normal, const Numbers& radius) {
     const size_t n = body.size();
     require_equal(R.shape(0), {P.shape(0)});
-    require_equal(n, {radius.size()});
+    require_equal(n, {code.size(), radius.size()});
     below(R.shape(0), body);
     const auto positions = columns<3>(position, n), normals = columns<3>(normal, n);
     std::vector<ExpectedMarker> markers;
     for (size_t k = 0; k < n; ++k)
-        markers.push_back(ExpectedMarker::of(body(k), {positions.vector(k), normals.vector(k), radius(k)},
+        markers.push_back(ExpectedMarker::of(body(k), code(k),
+                                             {positions.vector(k), normals.vector(k), radius(k)},
                                              matrix_at(R.data() + 9 * body(k)), P.data() + 144 * body(k)));
     new (self) ExpectedMarkers(std::move(markers));
 }
@@ -53,6 +56,27 @@ Out covariances(const ExpectedMarkers& markers, double tau) {
         to += 9;
     }
     return all;
+}
+
+/// Markers in the world: (3, K, 3) positions, velocities and normals, and covariances of the positions.
+auto marker_states(const BodyStates& bodies, const Covariances& P, const Index& body, const Vectors& position,
+                   const Vectors& normal) {
+    const size_t n = body.size();
+    require_equal(bodies.size(), {P.shape(0)});
+    below(bodies.size(), body);
+    const auto positions = columns<3>(position, n), normals = columns<3>(normal, n);
+    auto [vectors, to] = make({3, n, 3});
+    auto [covariances, to_covariance] = make({n, 3, 3});
+    for (size_t k = 0; k < n; ++k) {
+        const Body& of = bodies[body(k)];
+        const Vector arm = of.R * positions.vector(k);
+        write(of.p + arm, to + 3 * k);
+        write(of.v + cross(of.omega, arm), to + 3 * (n + k));
+        write(of.R * normals.vector(k), to + 3 * (2 * n + k));
+        write(position_covariance(positions.vector(k), of.R, P.data() + 144 * body(k)),
+              to_covariance + 9 * k);
+    }
+    return std::make_tuple(vectors, covariances);
 }
 
 auto candidates(const ExpectedMarkers& markers, const FramePoses& poses, const DetectionColumns& detections,
@@ -70,6 +94,18 @@ auto candidates(const ExpectedMarkers& markers, const FramePoses& poses, const D
         *to++ = pair.cost;
     }
     return std::make_tuple(pairs, costs);
+}
+
+auto assigned(const In<int64_t, 2, -1>& pairs, const Numbers& cost, const Index& frame) {
+    const size_t n = cost.size();
+    require_equal(n, {pairs.shape(1)});
+    const int64_t *marker = pairs.data(), *detection = pairs.data() + n;
+    for (size_t k = 0; k < n; ++k) require_below(frame.size(), detection[k]);
+    std::vector<int64_t> chosen;
+    unlocked([&] { chosen = assign({marker, detection, cost.data(), n}, frame.data(), frame.size()); });
+    auto [numbers, to] = make<int64_t>({chosen.size()});
+    std::copy(chosen.begin(), chosen.end(), to);
+    return numbers;
 }
 
 /// The pairs of view v are those from first[v] to first[v + 1].
@@ -163,11 +199,13 @@ void bind_detections(nb::module_& m) {
     m.attr("SLACK_PX") = kSlackPx;
     nb::class_<DetectionColumns>(m, "DetectionColumns")
         .def(nb::init<const Index&, const Pairs&, const Matrices2&, const Matrices2&, const Numbers&,
-                      const Numbers&>());
+                      const Numbers&, const Numbers&>());
     nb::class_<ExpectedMarkers>(m, "ExpectedMarkers")
         .def("__init__", &make_expected)
         .def("covariances", &covariances)
         .def("candidates", &candidates);
+    m.def("marker_states", &marker_states);
+    m.def("assign", &assigned);
     m.def("labelings", &labelings);
     m.def("measure", &measure);
 }

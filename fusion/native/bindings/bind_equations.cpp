@@ -19,25 +19,29 @@ Out inverses(const Covariances& information) {
     return covariances;
 }
 
-Out log_ratios(const In<double, -1, 2, 12>& A, const In<double, -1, 2>& nu, const Numbers& other,
-               const Index& body, const Index& camera, const Mask& certain, const Covariances& P,
-               const Index& of_body, const Index& of_camera) {
+auto are_own(const In<double, -1, 2, 12>& A, const In<double, -1, 2>& nu, const Matrices2& cov,
+             const Numbers& log_density, const Index& body, const Index& camera, const Mask& certain,
+             const Covariances& information, const Index& of_body, const Index& of_camera, const Index& turn,
+             const Numbers& prior, const Numbers& added_px2) {
     const size_t n = body.size(), n_asked = of_body.size();
-    require_equal(n, {A.shape(0), nu.shape(0), other.size(), camera.size(), certain.size()});
-    require_equal(n_asked, {of_camera.size()});
-    below(P.shape(0), of_body);
+    require_equal(n, {A.shape(0), nu.shape(0), log_density.size(), camera.size(), certain.size()});
+    require_equal(n_asked, {of_camera.size(), turn.size(), prior.size(), added_px2.size()});
     const Evidence evidence{reinterpret_cast<const double (*)[2][kErrors]>(A.data()),
                             reinterpret_cast<const double (*)[2]>(nu.data()),
-                            other.data(),
+                            columns<4>(cov, n),
+                            log_density.data(),
                             body.data(),
-                            camera.data(),
-                            certain.data(),
-                            n};
-    auto [ratios, to] = make({n_asked});
-    for (size_t k = 0; k < n_asked; ++k)
-        to[k] = log_ratio(evidence, of_body(k), of_camera(k),
-                          reinterpret_cast<const ErrorMatrix*>(P.data())[of_body(k)]);
-    return ratios;
+                            camera.data()};
+    const Doubts doubts{below(information.shape(0), of_body),
+                        of_camera.data(),
+                        turn.data(),
+                        prior.data(),
+                        added_px2.data(),
+                        n_asked};
+    auto [own, to] = make<bool>({n});
+    std::copy_n(certain.data(), n, to);
+    accept(evidence, doubts, reinterpret_cast<const ErrorMatrix*>(information.data()), to);
+    return own;
 }
 
 auto eliminate_robots(const In<double, -1, 2, 24>& equations, const Numbers& weights, const Index& body,
@@ -103,7 +107,7 @@ void bind_equations(nb::module_& m) {
     m.attr("CAUCHY") = kCauchy;
     m.attr("NOMINAL_WEIGHT") = kNominalWeight;
     m.def("predict", &predict_bodies);
-    m.def("log_ratios", &log_ratios);
+    m.def("are_own", &are_own);
     m.def("eliminate_robots", &eliminate_robots);
     m.def("inverses", &inverses);
 }

@@ -197,6 +197,22 @@ class ArrayFit {
     BodyFit fit_;
 };
 
+/// (2, 2, N) L^-1 scale of N detections, where L L^T is the covariance.
+Out whiten(const Matrices2& cov, const Matrices2& scale) {
+    const size_t n = cov.shape(2);
+    const auto P = columns<4>(cov, n), scales = columns<4>(scale, n);
+    auto [whitened, to] = make({2, 2, n});
+    for (size_t k = 0; k < n; ++k) {
+        const double a = std::sqrt(P.at(0, k)), b = P.at(1, k) / a, c = std::sqrt(P.at(3, k) - b * b);
+        for (int j = 0; j < 2; ++j) {
+            const double first = scales.at(j, k) / a;
+            to[j * n + k] = first;
+            to[(2 + j) * n + k] = (scales.at(2 + j, k) - b * first) / c;
+        }
+    }
+    return whitened;
+}
+
 /// (N,) squared lengths in pixels of N whitened errors, whose covariances are `cov`; NaN where `whiten` is.
 Out squared_px(const In<double, -1, 2>& errors, const Matrices2& cov, const Matrices2& whiten) {
     const size_t n = errors.shape(0);
@@ -280,6 +296,7 @@ void bind_poses(nb::module_& m) {
         .def("covariances", &ArrayFit::covariances)
         .def("costs", &ArrayFit::costs)
         .def("centres", &ArrayFit::centres);
+    m.def("whiten", &whiten);
     m.def("squared_px", &squared_px);
     m.def("shears", &shears_of);
     m.def("respond", &respond_arrays);

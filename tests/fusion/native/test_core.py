@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
+from camera_node.foundation.arrays import Array, Index, Mask
 from camera_node.geometry.pose import rotation_from_vector
 from fusion import _core
 from fusion.model.states import States, predict
-from fusion.tracking.assignment import assign
 from tests.fusion import equations
 from tests.fusion.native.scene import ARRAY, BODIES, scene
 
@@ -131,7 +131,9 @@ def test_whitened_errors_are_distances_in_pixels():
     root, scale, pixels = random.normal(size=(5, 2, 3)), random.normal(size=(5, 2, 2)), np.ones((5, 2))
     cov = root @ root.transpose(0, 2, 1)
     inverse = np.linalg.inv(np.linalg.cholesky(cov))
+    columns = np.ascontiguousarray(cov.transpose(1, 2, 0)), np.ascontiguousarray(scale.transpose(1, 2, 0))
     whiten = np.ascontiguousarray((inverse @ scale).transpose(1, 2, 0))
+    assert_near(_core.whiten(*columns), whiten)
     whiten[..., 4] = np.nan
     errors = (inverse @ pixels[..., None])[..., 0]
     found = _core.squared_px(errors, np.ascontiguousarray(cov.transpose(1, 2, 0)), whiten)
@@ -139,25 +141,47 @@ def test_whitened_errors_are_distances_in_pixels():
     assert np.isnan(found[4])
 
 
-def test_likelihoods_are_those_of_the_innovations():
+@pytest.mark.parametrize("added_px2", [0.0, 0.7])
+def test_assignments_are_own_that_are_more_probable_than_other_roundels(added_px2: float):
+    """Compared with the innovations of all, and of the certain ones alone, by their covariances in pixels; a prior just
+    above and just below the likelihood ratio decides."""
     random = np.random.default_rng(9)
     n, of_body, of_camera = 60, np.array([0, 1, 2, 2]), np.array([-1, 0, 1, 2])
-    A, nu, other = random.normal(size=(n, 2, 12)), random.normal(size=(n, 2)), random.normal(size=n)
+    J, nu_px, log_density = random.normal(size=(n, 2, 12)), random.normal(size=(n, 2)), random.normal(size=n)
     (body, camera), certain = random.integers(0, 3, (2, n)), random.random(n) < 0.5
-    root = random.normal(size=(3, 12, 20))
-    P = root @ root.transpose(0, 2, 1)
-    found = _core.log_ratios(A, nu, other, body, camera, certain, P, of_body, of_camera)
-    for k, b, c in zip(range(len(of_body)), of_body, of_camera, strict=True):
+    root, noise = random.normal(size=(3, 12, 20)), random.normal(size=(n, 2, 4))
+    P, cov = root @ root.transpose(0, 2, 1), noise @ noise.transpose(0, 2, 1)
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
+    evidence = whiten @ J, (whiten @ nu_px[..., None])[..., 0], np.moveaxis(cov, 0, 2).copy(), log_density
+
+    def judged(of_body: Index, of_camera: Index, turn: Index, prior: Array) -> Mask:
+        doubts = of_body, of_camera, turn, prior, np.full(len(prior), added_px2)
+        return _core.are_own(*evidence, body, camera, certain, _core.inverses(P), *doubts)
+
+    def ratio(b: int, c: int, certain: Mask) -> tuple[float, Mask]:
         beside, new = ((body == b) & mask for mask in (certain, ~certain & ((c < 0) | (camera == c))))
-        both = np.concatenate([np.flatnonzero(beside), np.flatnonzero(new)])
         likelihoods = []
-        for rows in (both, np.flatnonzero(beside)):
-            J = A[rows].reshape(-1, 12)
-            S, e = J @ P[b] @ J.T + np.eye(len(J)), nu[rows].ravel()
+        for rows in (np.flatnonzero(beside | new), np.flatnonzero(beside)):
+            A, of_noise = J[rows].reshape(-1, 12), np.zeros((2 * len(rows), 2 * len(rows)))
+            for i, k in enumerate(rows):
+                of_noise[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = cov[k] + added_px2 * np.eye(2)
+            S, e = A @ P[b] @ A.T + of_noise, nu_px[rows].ravel()
             likelihoods.append(-0.5 * (e @ np.linalg.solve(S, e) + np.linalg.slogdet(2 * np.pi * S)[1]))
-        assert_near(found[k], likelihoods[0] - likelihoods[1] - other[new].sum())
+        return likelihoods[0] - likelihoods[1] - log_density[new].sum(), new
+
+    expected = [ratio(b, c, certain) for b, c in zip(of_body, of_camera, strict=True)]
+    prior = np.array([1e-6 - value for value, _ in expected])
+    together = np.zeros(4, np.intp)
+    assert (judged(of_body, of_camera, together, prior - 2e-6) == certain).all()
+    accepted = certain | np.any([new for _, new in expected], axis=0)
+    assert (judged(of_body, of_camera, together, prior) == accepted).all()
+    # In turns, the last view is judged given the one before.
+    later, new = ratio(2, 2, certain | expected[2][1])
+    for aside, also in ((1e-6, new), (-1e-6, np.zeros(n, bool))):
+        turns = judged(of_body[2:], of_camera[2:], np.arange(2), np.array([prior[2], aside - later]))
+        assert (turns == (certain | expected[2][1] | also)).all()
     with pytest.raises(IndexError):
-        _core.log_ratios(A, nu, other, body, camera, certain, P, of_body + 1, of_camera)
+        judged(of_body + 1, of_camera, together, prior)
 
 
 def test_prediction_equals_the_motion_model():
@@ -180,7 +204,7 @@ def test_assignment_chooses_the_most_pairs_at_the_lowest_cost(seed: int):
     marker, detection = np.nonzero(random.random((25, len(frame))) < random.uniform(0.02, 1))
     order = np.argsort(frame[detection], kind="stable")
     pairs, costs = np.stack([marker, detection])[:, order], random.normal(size=len(order))
-    chosen = assign(pairs, costs, frame)
+    chosen = _core.assign(pairs, costs, frame)
     expected = 0
     for f in range(3):
         dense = np.full((25, len(frame)), 1e4)
@@ -223,7 +247,7 @@ def test_candidates_are_the_pairs_within_the_gates(spread):
     rows = random.choice(len(discs), 100, replace=False)
     rows = rows[np.argsort(discs.body[rows], kind="stable")]  # in groups
     of = discs.select(rows)
-    expected = _core.ExpectedMarkers(states.R, states.P, of.body, of.position, of.normal, of.radius)
+    expected = _core.ExpectedMarkers(states.R, states.P, of.body, of.body, of.position, of.normal, of.radius)
     poses = ARRAY.frame_poses(states, exposures)
     (marker, sighting), cost = expected.candidates(
         poses, seen.detections.native, ARRAY.focal[exposures.camera]

@@ -31,11 +31,11 @@ EXPOSURE_ARRAYS = np.tile(np.eye(3), (F, 1, 1)), -2 * np.ones((F, 3)), np.zeros(
 ALONG_Z = np.tile([[0.0], [0.0], [1.0]], N)
 DISC_ARRAYS = FRAME, BODY, np.zeros((3, N)), ALONG_Z, np.full(N, 0.0625), np.full(N, 0.0625)
 SCALES, FOCAL, FALSE = np.tile(np.eye(2)[..., None], N), np.full(F, 800.0), np.zeros(B, bool)
-DETECTION_ARRAYS = FRAME, np.zeros((2, N)), SCALES, SCALES, np.ones(N), np.ones(N)
+DETECTION_ARRAYS = FRAME, np.zeros((2, N)), SCALES, SCALES, np.ones(N), np.ones(N), np.ones(N)
 VIEWPOINT_ARRAYS = np.arange(F), np.zeros((F, 3))
 VIEWPOINTS = _core.Viewpoints(*VIEWPOINT_ARRAYS)
 POSES = _core.FramePoses(_core.BodyStates(*BODY_ARRAYS), _core.CameraExposures(*EXPOSURE_ARRAYS))
-MARKERS = _core.ExpectedMarkers(R, P, BODY, *DISC_ARRAYS[2:5])
+MARKERS = _core.ExpectedMarkers(R, P, BODY, BODY, *DISC_ARRAYS[2:5])
 OUTLINES = np.ones((2, N)), np.zeros(N), SCALES, np.ones(N)
 
 
@@ -52,10 +52,17 @@ CALLS = {
     "linearize_centres": of_discs(POSES.linearize_centres, np.zeros((2, N)), SCALES, FALSE),
     "linearize_outlines": of_discs(POSES.linearize_outlines, *OUTLINES),
     "DetectionColumns": (_core.DetectionColumns, DETECTION_ARRAYS),
-    "ExpectedMarkers": (_core.ExpectedMarkers, (R, P, BODY, *DISC_ARRAYS[2:5])),
+    "ExpectedMarkers": (
+        lambda R, P, body, *shapes: _core.ExpectedMarkers(R, P, body, BODY, *shapes),
+        (R, P, BODY, *DISC_ARRAYS[2:5]),
+    ),
     "candidates": (
-        lambda *given: MARKERS.candidates(POSES, _core.DetectionColumns(*given[:6]), given[6]),
+        lambda *given: MARKERS.candidates(POSES, _core.DetectionColumns(*given[:7]), given[7]),
         (*DETECTION_ARRAYS, FOCAL),
+    ),
+    "assign": (
+        lambda pairs, cost: _core.assign(pairs, cost, FRAME),
+        (np.stack([BODY, np.arange(N)]), np.zeros(N)),
     ),
     "shears": (
         _core.shears,
@@ -81,10 +88,14 @@ CALLS = {
             *(np.ones(N, bool), np.ones(N, bool), P, np.zeros((N, 2, 13))),
         ),
     ),
+    "whiten": (_core.whiten, (SCALES, SCALES)),
     "squared_px": (_core.squared_px, (np.ones((N, 2)), SCALES, SCALES)),
-    "log_ratios": (
-        _core.log_ratios,
-        (np.ones((N, 2, 12)), np.ones((N, 2)), np.ones(N), BODY, FRAME, np.zeros(N, bool), P, BODY, FRAME),
+    "are_own": (
+        _core.are_own,
+        (
+            *(np.ones((N, 2, 12)), np.ones((N, 2)), SCALES, np.ones(N), BODY, FRAME, np.zeros(N, bool), P),
+            *(BODY, FRAME, FRAME, np.zeros(N), np.zeros(N)),
+        ),
     ),
     "inverses": (_core.inverses, (P,)),
     "Viewpoints": (_core.Viewpoints, VIEWPOINT_ARRAYS),
@@ -107,8 +118,8 @@ CALLS = {
         ),
     ),
 }
-# Constructors check the indices only where they know what the indices refer to; `log_ratios` only compares cameras.
-UNCHECKED = {"DiscColumns", "DetectionColumns", "log_ratios"}
+# Constructors check the indices only where they know what the indices refer to; `are_own` only compares cameras.
+UNCHECKED = {"DiscColumns", "DetectionColumns", "are_own"}
 ANY_LENGTH = {"inverses", "Viewpoints"}  # functions of arrays whose lengths are independent
 
 
