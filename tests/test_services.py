@@ -20,7 +20,7 @@ from tests.conftest import ROOT, free_port
 from tests.fusion.serving import config, serving
 from tests.processes import run_here
 from tests.seccomp import HEADER
-from tests.waiting import DEADLINE_S, Inbox
+from tests.waiting import DEADLINE_S, Inbox, in_thread
 
 pytestmark = pytest.mark.computed
 
@@ -47,13 +47,8 @@ def manager(folder: Path) -> Iterator[tuple[Inbox, dict[str, str]]]:
                 with contextlib.suppress(TimeoutError):
                     inbox.put(receiver.recv(4096).decode())
 
-        thread = threading.Thread(target=receive)
-        thread.start()
-        try:
+        with in_thread(receive, done.set):
             yield inbox, {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": str(round(1e6 * WATCHDOG_S))}
-        finally:
-            done.set()
-            thread.join(DEADLINE_S)
 
 
 def arguments_of(unit: str, folder: Path) -> list[str]:

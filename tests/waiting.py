@@ -42,6 +42,19 @@ def poll(
 
 
 @contextmanager
+def in_thread(run: Callable[[], object], end: Callable[[], object]) -> Iterator[None]:
+    """Run a function in a thread while the block runs; then `end` is called, which must make it return."""
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        end()
+        thread.join(DEADLINE_S)
+        assert not thread.is_alive(), "the thread does not end"
+
+
+@contextmanager
 def repeating(act: Callable[[], object], interval_s: float = 0.0) -> Iterator[None]:
     """Call `act` again and again in a thread, `interval_s` after its last end, until the block ends."""
     stop = threading.Event()
@@ -50,13 +63,8 @@ def repeating(act: Callable[[], object], interval_s: float = 0.0) -> Iterator[No
         while not stop.wait(interval_s):
             act()
 
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
+    with in_thread(run, stop.set):
         yield
-    finally:
-        stop.set()
-        thread.join(DEADLINE_S)
 
 
 def wait_for(

@@ -36,7 +36,7 @@ from fusion.protocol.pose_messages import RobotPoses
 from tests.benchmarks.fusion_load import LENS, Load
 from tests.benchmarks.fusion_server import ARENA, DEADLINE_S, publish, serving
 from tests.conftest import free_port
-from tests.waiting import wait_for, wait_for_port
+from tests.waiting import in_thread, wait_for, wait_for_port
 
 LIMIT = 0.30  # of a core
 PICTURES_HZ = 3
@@ -186,13 +186,8 @@ def sending(load: Load, session: zenoh.Session) -> Iterator[None]:
                 for key, data in pictures:
                     session.put(key, data)
 
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
+    with in_thread(send, stop.set):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 def picture_messages(load: Load) -> list[tuple[str, bytes]]:

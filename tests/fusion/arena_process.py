@@ -16,7 +16,7 @@ from camera_node.protocol.session import open_client
 from fusion.server.arena_config import ArenaConfig
 from tests.fusion.serving import KEYS, REAL_TIME_MS, config
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, WIDE, Arena, circle
-from tests.waiting import DEADLINE_S
+from tests.waiting import in_thread
 
 LOOP_S = 8.0  # of the motions, which repeat
 ARENA = Arena(
@@ -61,10 +61,5 @@ def cameras_at(
             for message in in_real_time(messages, LOOP_S, stop):
                 session.put(KEYS.detections(message.camera), encode(altered(message)))
 
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
+    with in_thread(publish, stop.set):
         yield
-    finally:
-        stop.set()
-        thread.join(DEADLINE_S)

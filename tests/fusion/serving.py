@@ -3,10 +3,9 @@
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import msgspec
@@ -20,7 +19,7 @@ from fusion.server.arena_config import ArenaConfig, Zone
 from fusion.server.server import Server
 from tests.conftest import ROOT
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, line
-from tests.waiting import DEADLINE_S, Inbox, wait_for
+from tests.waiting import DEADLINE_S, Inbox, in_thread, wait_for
 
 ARENA = Arena({"a": TRIANGLE}, {"a": line((0.2, 0.1, 0.2), tilt=(0.1, 0.0, 0.3))}, sigma_px=0.05)
 KEYS = Keys("test")
@@ -59,16 +58,9 @@ def serving(settings: ArenaConfig) -> Iterator[tuple[Server, Client]]:
         yield server, client
 
 
-@contextmanager
-def running_server(server: Server) -> Iterator[None]:
+def running_server(server: Server) -> AbstractContextManager[None]:
     """Serve in a thread until the block ends."""
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    try:
-        yield
-    finally:
-        server.stop()
-        thread.join(DEADLINE_S)
+    return in_thread(server.run, server.stop)
 
 
 @contextmanager

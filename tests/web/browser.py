@@ -9,7 +9,8 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +19,7 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
 
 from tests.conftest import free_port
 from tests.processes import killed_at_end
-from tests.waiting import DEADLINE_S, wait_for
+from tests.waiting import DEADLINE_S, in_thread, wait_for
 from web.page_access import PageAccess
 from web.state.feed import Feed
 from web.view import PanelSection, View
@@ -66,14 +67,8 @@ def loopback() -> PageAccess:
 def drawing(view: View) -> Iterator[None]:
     """Draw until the block ends, then close the view."""
     stop = threading.Event()
-    thread = threading.Thread(target=view.run, args=(stop,))
-    thread.start()
-    try:
+    with closing(view), in_thread(partial(view.run, stop), stop.set):
         yield
-    finally:
-        stop.set()
-        thread.join()
-        view.close()
 
 
 @contextmanager

@@ -5,7 +5,6 @@ import errno
 import os
 import re
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -199,18 +198,14 @@ def test_true_positions_appear_and_disappear(arena: LiveArena, feed: Feed):
 
 def test_a_drawing_that_fails_is_counted(feed: Feed, monkeypatch: pytest.MonkeyPatch):
     """The view continues after an exception, and counts it."""
-    view, stop = View(feed, loopback()), threading.Event()
+    view = View(feed, loopback())
 
     def fail() -> None:
         raise ValueError("odd")
 
     monkeypatch.setattr(view, "update", fail)
-    thread = threading.Thread(target=view.run, args=(stop,))
-    thread.start()
-    wait_for(lambda: feed.state().faults["drawing: ValueError('odd')"] >= 2)
-    stop.set()
-    thread.join()
-    view.close()
+    with drawing(view):
+        wait_for(lambda: feed.state().faults["drawing: ValueError('odd')"] >= 2)
 
 
 def test_a_port_in_use_is_an_error():

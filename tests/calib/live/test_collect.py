@@ -10,6 +10,7 @@ from calib.live.collect import collect_with_progress
 from camera_node.protocol.messages import Keys, encode
 from camera_node.protocol.session import open_client, open_router
 from tests.calib.synthetic import record, ring
+from tests.waiting import in_thread
 
 
 def test_detections_are_collected_past_invalid_messages(endpoint: str):
@@ -26,10 +27,8 @@ def test_detections_are_collected_past_invalid_messages(endpoint: str):
             for message in messages:
                 sender.put(encode(message))
 
-        thread = threading.Thread(target=send)
-        thread.start()
-        collected = collect_with_progress(client, "test", 3.0, "collecting")
-        thread.join(10)
+        with in_thread(send, listening.set):
+            collected = collect_with_progress(client, "test", 3.0, "collecting")
         assert (len(collected.messages), collected.invalid) == (len(messages), 1)
 
 

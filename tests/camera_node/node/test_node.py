@@ -6,7 +6,6 @@ import logging
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +22,7 @@ from camera_node.node.node import Node, NodeOptions
 from camera_node.protocol.messages import CameraStatus, ClockReply, Detections, Keys, Settings, decode, encode
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.node.picture import CENTRE, render
-from tests.waiting import DEADLINE_S
+from tests.waiting import DEADLINE_S, in_thread
 
 MS = 1_000_000
 START = 1_700_000_000_000_000_000
@@ -54,22 +53,17 @@ def slow(tmp_path: Path) -> Path:
 @pytest.fixture
 def running(network):
     """`running(folder)`: a node in a thread, until the test ends."""
-    nodes: list[tuple[Node, threading.Thread]] = []
+    nodes = contextlib.ExitStack()
 
     def start(folder: Path, **settings) -> Node:
         source = open_source(str(folder), SourceSettings(**settings))
         keep_stamps = source.is_recording and settings.get("stamps", "recorded") == "recorded"
         node = Node("cam0", source, Detector(), network.client(), NodeOptions(keep_stamps=keep_stamps))
-        thread = threading.Thread(target=node.run)
-        thread.start()
-        nodes.append((node, thread))
+        nodes.enter_context(in_thread(node.run, node.close))
         return node
 
-    yield start
-    for node, thread in nodes:
-        node.close()
-        thread.join(10)
-        assert not thread.is_alive()
+    with nodes:
+        yield start
 
 
 def subscribe(session: zenoh.Session, key: str, kind: type, inbox):

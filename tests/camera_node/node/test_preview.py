@@ -2,7 +2,6 @@
 """Small pictures of a camera: sent only while someone watches, bounded in size and cost; and requests to a node."""
 
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -35,7 +34,7 @@ from camera_node.protocol.requests import encode_jpeg
 from camera_node.protocol.server_connection import Connection
 from camera_node.sources.frame import SourceSettings
 from tests.camera_node.node.picture import CENTRE, render
-from tests.waiting import patient, wait_for
+from tests.waiting import in_thread, patient, wait_for
 
 KEYS = Keys("arena")
 SIZE = st.integers(1, 900)
@@ -51,12 +50,8 @@ def node(network, tmp_path: Path) -> Iterator[Node]:
     for k in range(1, 600):
         (folder / f"{100_000_000 * k}.png").symlink_to(folder / "0.png")
     node = Node("cam0", open_source(str(folder), SourceSettings(stamps="now")), Detector(), network.client())
-    thread = threading.Thread(target=node.run)
-    thread.start()
-    yield node
-    node.close()
-    thread.join(10)
-    assert not thread.is_alive()
+    with in_thread(node.run, node.close):
+        yield node
 
 
 def test_pictures_are_sent_only_while_someone_subscribes(network, inbox, node: Node):

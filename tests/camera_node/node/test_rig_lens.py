@@ -19,6 +19,7 @@ from camera_node.node.rig_lens import RigLens
 from camera_node.protocol.messages import Detections, Keys, decode, encode
 from camera_node.sources.frame import Frame, Source
 from tests.camera_node.tracing import Sight, trace
+from tests.waiting import in_thread
 
 KEYS = Keys("arena")
 LENS = Camera(width=120, height=90, fx=300.0, fy=300.0, cx=59.5, cy=44.5, distortion=(-0.1, 0.0, 0.0, 0.0))
@@ -111,15 +112,9 @@ def test_a_nodes_detections_use_the_servers_lens(network, inbox, found):
     )
     router.declare_queryable(KEYS.rig, lambda query: query.reply(KEYS.rig, rig_of(LENS)))
     node = Node("cam0", StillCamera(), Detector(), network.client())
-    thread = threading.Thread(target=node.run)
-    thread.start()
-    try:
+    with in_thread(node.run, node.close):
         assert got.until(len)
         free = got.items[0].unpack().cov
         token = router.liveliness().declare_token(KEYS.fusion_alive)
         assert got.until(lambda items: np.trace(items[-1].unpack().cov[0]) < 0.9 * np.trace(free[0]))
         token.undeclare()
-    finally:
-        node.close()
-        thread.join(10)
-    assert not thread.is_alive()

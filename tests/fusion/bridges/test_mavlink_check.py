@@ -12,7 +12,7 @@ from fusion.bridges.mavlink_frames import FrdFrames, roll_pitch_yaw
 from tests.fusion.bridges.autopilot import Autopilot
 from tests.fusion.bridges.pose_server import PoseServer, moving_pose
 from tests.processes import run_program
-from tests.waiting import DEADLINE_S
+from tests.waiting import in_thread
 
 TIMES_NS = np.arange(0, 10 * 10**9, 20_000_000)  # of poses of a robot that circles, climbs and turns
 
@@ -121,12 +121,9 @@ def test_the_command_compares_and_ends(endpoint: str):
                     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
                     send.attitude_send(ms, 0, 0, float(yaw), 0, 0, 0)
 
-        flight = threading.Thread(target=fly)
-        flight.start()
         to = f"udp:127.0.0.1:{autopilot.port}"
         words = ("--connect", endpoint, "--arena", "test", "--to", to, "--check-s", "5")
-        program = run_program("fusion", "mavlink", "rover", *words)
-        ended.set()
-        flight.join(DEADLINE_S)
+        with in_thread(fly, ended.set):
+            program = run_program("fusion", "mavlink", "rover", *words)
     assert re.search(r"ok +frames differ by [+-]0 degrees", program.stdout), program.stdout + program.stderr
     assert re.search(r"ok +yaw differs by [+-]0 degrees", program.stdout)

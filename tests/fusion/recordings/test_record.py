@@ -3,6 +3,7 @@
 
 import csv
 import threading
+from functools import partial
 from importlib.metadata import version
 from itertools import chain, count
 from pathlib import Path
@@ -33,7 +34,7 @@ from tests.fusion.serving import ARENA, KEYS, config, live, send, serving
 from tests.fusion.synthetic import TRIANGLE, Arena, line, precise
 from tests.fusion.tracks import errors, poses_of
 from tests.processes import run_program
-from tests.waiting import DEADLINE_S, repeating, wait_for
+from tests.waiting import DEADLINE_S, in_thread, repeating, wait_for
 
 BUSY_S = 3.5  # more than 3 s, after which the recorder gave up before, with answers of up to 1 s
 MOVING = Arena(
@@ -96,16 +97,13 @@ def test_robots_that_are_declared_after_the_start_are_recorded(tmp_path, caplog:
     with serving(config(tmp_path)) as (server, client), RecordingWriter(path) as writer:
         client.change_robots(remove=("a",))
         recorder = ArenaRecorder(client.connection, "test", writer)
-        thread = threading.Thread(target=recorder.run, args=(stop,))
-        thread.start()
-        wait_for(lambda: recorder.robots == frozenset())
-        wait_for(lambda: NO_ROBOTS in caplog.text)
-        client.change_robots(define={"late": TRIANGLE})
-        wait_for(lambda: recorder.robots == {"late"})
-        send(server, live(ARENA.messages(10)))
-        wait_for(lambda: writer.counts.get(KEYS.detections("cam0"), 0) == 10)
-        stop.set()
-        thread.join(DEADLINE_S)
+        with in_thread(partial(recorder.run, stop), stop.set):
+            wait_for(lambda: recorder.robots == frozenset())
+            wait_for(lambda: NO_ROBOTS in caplog.text)
+            client.change_robots(define={"late": TRIANGLE})
+            wait_for(lambda: recorder.robots == {"late"})
+            send(server, live(ARENA.messages(10)))
+            wait_for(lambda: writer.counts.get(KEYS.detections("cam0"), 0) == 10)
     assert read_recording(path).robots == {"late": TRIANGLE}
     assert replay(path, out=tmp_path / "fused.mcap") == 0
 
@@ -194,14 +192,11 @@ def test_a_public_recording_has_pictures_and_versions(tmp_path):
         stop = threading.Event()
         with RecordingWriter(path) as writer:
             recorder = ArenaRecorder(client.connection, "test", writer, is_public=True)
-            thread = threading.Thread(target=recorder.run, args=[stop])
-            thread.start()
-            wait_for(
-                lambda: writer.counts[KEYS.snapshot("cam0")] >= 2,
-                lambda: send(server, live(ARENA.messages(3))),
-            )
-            stop.set()
-            thread.join(DEADLINE_S)
+            with in_thread(partial(recorder.run, stop), stop.set):
+                wait_for(
+                    lambda: writer.counts[KEYS.snapshot("cam0")] >= 2,
+                    lambda: send(server, live(ARENA.messages(3))),
+                )
         camera.undeclare()
     assert trim(path, part, from_s=0.5) == 0
     for file in (path, part):

@@ -23,7 +23,7 @@ from tests.calib.synthetic import assert_near, record, ring
 from tests.conftest import ROOT, free_port
 from tests.fusion.serving import ARENA, KEYS, config, serving, serving_process
 from tests.processes import run_program
-from tests.waiting import DEADLINE_S
+from tests.waiting import DEADLINE_S, in_thread
 
 OTHER = Rig(
     cameras={
@@ -74,14 +74,9 @@ def waving(endpoint: str, messages: list[Detections]) -> Iterator[None]:
                     block = zenoh.CongestionControl.BLOCK  # nothing may be dropped at this rate
                     session.put(KEYS.detections(message.camera), encode(message), congestion_control=block)
 
-        thread = threading.Thread(target=publish)
-        thread.start()
-        try:
+        with in_thread(publish, recording.set):
             yield
-        finally:
-            recording.set()
-            thread.join(DEADLINE_S)
-            token.undeclare()
+        token.undeclare()
 
 
 def require_in_force(endpoint: str, file: Path, done: subprocess.CompletedProcess[str]) -> None:

@@ -4,6 +4,7 @@
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from camera_node.protocol.messages import encode
 from fusion.commands.trim import trim
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import Robots, robots_key
-from tests.waiting import wait_for
+from tests.waiting import in_thread, wait_for
 from tests.web.arena import ArenaMessages, four_cameras
 from tests.web.browser import loopback
 from web.errors import WebError
@@ -62,13 +63,8 @@ def recording(tmp_path: Path) -> Path:
 def playing(recording: Path) -> Iterator[tuple[RecordingPlayer, Feed]]:
     player, stop = RecordingPlayer(recording), threading.Event()
     feed = Feed(player.arena, clock=player.seconds)
-    thread = threading.Thread(target=player.run, args=(feed, stop))
-    thread.start()
-    try:
+    with in_thread(partial(player.run, feed, stop), stop.set):
         yield player, feed
-    finally:
-        stop.set()
-        thread.join()
 
 
 def position(feed: Feed) -> float:
