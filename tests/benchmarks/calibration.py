@@ -24,12 +24,18 @@ from rich.table import Table
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.wand_report import WandCalibration
-from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
 from tests.benchmarks.calibration_acceptance import run as run_acceptance
 from tests.benchmarks.calibration_data import run as run_data
 from tests.benchmarks.calibration_honesty import run as run_honesty
-from tests.benchmarks.calibration_recordings import DATA, SQUARE_M, board_corners, corner_errors, recording
+from tests.benchmarks.calibration_recordings import (
+    DATA,
+    SQUARE_M,
+    board_corners,
+    corner_errors,
+    recording,
+    rms,
+)
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, joint_error, roughly
 
@@ -66,9 +72,9 @@ def simulated(
     cost_s = float(cost.mean())
     rows = [
         ("cameras placed", f"{placed.min()}", f"{scenario.cameras}"),
-        ("centres, mm RMS", f"{1e3 * _rms(shift):.3f}", "<= 1"),
-        ("rotations, degrees RMS", f"{np.degrees(_rms(turn)):.4f}", "<= 0.02"),
-        ("time offsets, ms RMS", f"{_rms(offset):.3f}", "<= 0.3"),
+        ("centres, mm RMS", f"{1e3 * rms(shift):.3f}", "<= 1"),
+        ("rotations, degrees RMS", f"{np.degrees(rms(turn)):.4f}", "<= 0.02"),
+        ("time offsets, ms RMS", f"{rms(offset):.3f}", "<= 0.3"),
         ("squared Mahalanobis error", f"{squared.sum():.0f}", _chi_square(int(degrees.sum()))),
         ("seconds", f"{cost_s:.2f}", f"<= {goal_s:g}"),
     ]
@@ -86,17 +92,13 @@ def _run(
     squared, degrees = joint_error(result, recorded.truth)
     return (
         len(result.rig.placed()),
-        _rms(shift),
-        _rms(turn),
+        rms(shift),
+        rms(turn),
         offset_error(result, recorded),
         squared,
         degrees,
         cost,
     )
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 def _chi_square(degrees: int) -> str:
@@ -109,7 +111,7 @@ def offset_error(result: WandCalibration, recorded: SimulatedRecording) -> float
     error = np.array(
         [c.time_offset_ms - recorded.truth.cameras[n].time_offset_ms for n, c in cameras.items()]
     )
-    return float(np.sqrt(((error - error.mean()) ** 2).mean()))
+    return rms(error - error.mean())
 
 
 def waved_led() -> tuple[list[Row], float]:
@@ -136,7 +138,7 @@ def webcams_wand() -> tuple[list[Row], float]:
     errors = corner_errors(result.rig, recording(DATA / "webcams" / "corners_observations.csv")[1])
     rows = [
         ("cameras placed", f"{len(result.rig.placed())}", "4"),
-        ("distances of held-out corners, mm RMS", f"{1e3 * np.sqrt((errors**2).mean()):.3f}", "<= 0.8"),
+        ("distances of held-out corners, mm RMS", f"{1e3 * rms(errors):.3f}", "<= 0.8"),
         ("distances", f"{len(errors)}", ""),
         ("seconds", f"{cost:.2f}", "<= 2"),
     ]

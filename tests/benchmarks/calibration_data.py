@@ -15,7 +15,7 @@ starts. Recordings are those of ../shared/data.
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -29,6 +29,7 @@ from scipy.sparse import coo_array
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, with_distortion
 from calib.rig.rig import Rig
+from calib.rig.triangulation import triangulate_points
 from calib.wand.calibrate import calibrate
 from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array, Index
@@ -36,7 +37,17 @@ from camera_node.geometry.body import Body
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import detect_frames
-from tests.benchmarks.calibration_recordings import DATA, board_corners, corner_errors, recording
+from tests.benchmarks.calibration_recordings import (
+    DATA,
+    Tracks,
+    board_corners,
+    corner_errors,
+    pixels_at,
+    recording,
+    rms,
+    sorted_track,
+    tracks_of_messages,
+)
 from tests.calib.mishaps import repack
 from tests.calib.synthetic import WAND, camera_errors
 from tests.truth import true_camera
@@ -58,10 +69,6 @@ class Comparison:
     plain: float
 
 
-# Of one camera, by marker: true times (n,) and pixels (n, 2).
-Tracks = Mapping[int, tuple[Array, Array]]
-
-
 @dataclass(frozen=True, slots=True)
 class Points:
     """Images of points: (n,) camera and point, (n, 2) pixels; (l, 2) pairs of points and (l,) their known distances,
@@ -81,14 +88,12 @@ def gather_points(tracks: Sequence[Tracks], gap_s: float, wand: Body | None = No
     labels = sorted({label for track in tracks for label in track})
     rows, pairs, lengths, count = [], [], [], 0
     for t_s in np.unique(np.concatenate([t for t, _ in most.values()])):
-        found = {}
-        for label in labels:
-            images = [
-                (c, uv) for c, track in enumerate(tracks) if (uv := _at(track, label, t_s, gap_s)) is not None
-            ]
-            if len(images) >= 2:
+        found, every = {}, pixels_at(tracks, labels, t_s, gap_s)
+        for label, uv in zip(labels, np.swapaxes(every, 0, 1), strict=True):
+            cameras = np.flatnonzero(np.isfinite(uv[:, 0])).tolist()
+            if len(cameras) >= 2:
                 found[label] = count
-                rows += [(c, count, *uv) for c, uv in images]
+                rows += [(c, count, *uv[c]) for c in cameras]
                 count += 1
         if wand is not None:
             for a, b in combinations(found, 2):
@@ -99,22 +104,6 @@ def gather_points(tracks: Sequence[Tracks], gap_s: float, wand: Body | None = No
     return Points(camera, point, table[:, 2:], np.array(pairs, np.intp).reshape(-1, 2), np.array(lengths))
 
 
-def tracks_of_messages(rig: Rig, messages: Sequence[Detections]) -> list[Tracks]:
-    """The numbered detections of the placed cameras."""
-    return [_track(camera, name, messages) for name, camera in rig.placed().items()]
-
-
-def _track(camera: Camera, name: str, messages: Sequence[Detections]) -> Tracks:
-    rows: dict[int, list[tuple[float, ...]]] = {}
-    for message in messages:
-        if message.camera == name:
-            seen = message.unpack()
-            t_s = message.t_ns * 1e-9 + camera.time_offset_ms * 1e-3
-            for label, uv in zip(seen.id.tolist(), seen.uv.tolist(), strict=True):
-                rows.setdefault(label, []).append((t_s, *uv))
-    return {label: _sorted_track(np.array(table)) for label, table in rows.items()}
-
-
 def tracks_of_result(result: WandCalibration) -> list[Tracks]:
     """The detections that a calibration labeled, at the discs' own centres, whether it rejected them or not."""
     seen, state = result.observations, result.adjusted.state
@@ -122,29 +111,11 @@ def tracks_of_result(result: WandCalibration) -> list[Tracks]:
     table = np.column_stack([t_s, seen.uv])
     return [
         {
-            label: _sorted_track(table[(seen.camera == camera) & (seen.label == label)])
+            label: sorted_track(table[(seen.camera == camera) & (seen.label == label)])
             for label in np.unique(seen.label).tolist()
         }
         for camera in range(len(result.names))
     ]
-
-
-def _sorted_track(table: Array) -> tuple[Array, Array]:
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    return table[:, 0], table[:, 1:]
-
-
-def _at(track: Tracks, label: int, t_s: float, gap_s: float) -> Array | None:
-    if label not in track:
-        return None
-    t, uv = track[label]
-    k = int(np.searchsorted(t, t_s))
-    if k < len(t) and t[k] == t_s:
-        return uv[k]
-    if not 0 < k < len(t) or t[k] - t[k - 1] > gap_s:
-        return None
-    share = (t_s - t[k - 1]) / (t[k] - t[k - 1])
-    return (1 - share) * uv[k - 1] + share * uv[k]
 
 
 def adjust_plainly(rig: Rig, points: Points) -> Rig:
@@ -206,26 +177,10 @@ def project(cameras: Sequence[Camera], points: Points, there: Array) -> Array:
 
 
 def triangulate(cameras: Sequence[Camera], points: Points) -> Array:
-    """(p, 3) points nearest to their rays, then at the least squares of their pixels."""
-    A, b = np.zeros((int(points.point.max()) + 1, 3, 3)), np.zeros((int(points.point.max()) + 1, 3))
-    for c, camera in enumerate(cameras):
-        rows, T = points.camera == c, camera.matrix()
-        rays = np.column_stack([camera.normalise(points.uv[rows]), np.ones(rows.sum())]) @ T[:3, :3].T
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        across = np.eye(3) - rays[:, :, None] * rays[:, None]
-        np.add.at(A, points.point[rows], across)
-        np.add.at(b, points.point[rows], across @ T[:3, 3])
-    there = np.linalg.solve(A, b[:, :, None])[:, :, 0]
-    for _ in range(5):
-        H, g = np.zeros_like(A), np.zeros_like(b)
-        for c, camera in enumerate(cameras):
-            rows, T = points.camera == c, camera.matrix()
-            uv, J = camera.project_with_jacobian((there[points.point[rows]] - T[:3, 3]) @ T[:3, :3])
-            J = J @ T[:3, :3].T
-            np.add.at(H, points.point[rows], J.mT @ J)
-            np.add.at(g, points.point[rows], (J.mT @ (points.uv[rows] - uv)[:, :, None])[:, :, 0])
-        there = there + np.linalg.solve(H, g[:, :, None])[:, :, 0]
-    return np.asarray(there, float)
+    """(p, 3) the points at the least squares of their pixels."""
+    uv = np.full((len(cameras), int(points.point.max()) + 1, 2), np.nan)
+    uv[points.camera, points.point] = points.uv
+    return triangulate_points(cameras, uv)
 
 
 def residuals_px(rig: Rig, points: Points) -> Array:
@@ -241,11 +196,11 @@ def waved_led() -> list[Comparison]:
     points = gather_points(tracks_of_messages(found, messages), gap_s=0.0)
     both = [residuals_px(r, points) for r in (found, adjust_plainly(found, points))]
     usual = np.all([off < OUTLIER * np.median(off) / 1.1774 for off in both], axis=0)
-    placed, every = len(found.placed()), [_rms(off) for off in both]
+    placed, every = len(found.placed()), [rms(off) for off in both]
     without = f"waved-led without {(~usual).sum()} outliers, px"
     return [
         Comparison("waved-led, RMS, px", placed, *every),
-        Comparison(without, placed, *(_rms(off[usual]) for off in both)),
+        Comparison(without, placed, *(rms(off[usual]) for off in both)),
         Comparison("waved-led, mean, px", placed, *(float(off.mean()) for off in both)),
     ]
 
@@ -260,12 +215,8 @@ def arena_small() -> Comparison:
     result = calibrate(rig, WAND, detect_frames(folder / "wand", inner_ratios=(WAND.inner_ratio,)))
     points = gather_points(tracks_of_result(result), result.adjusted.problem.gap_s, WAND)
     both = (result.rig, adjust_plainly(result.rig, points))
-    errors = (1e3 * _rms(camera_errors(r, truth)[0]) for r in both)
+    errors = (1e3 * rms(camera_errors(r, truth)[0]) for r in both)
     return Comparison("arena-small, camera positions, mm", len(result.names), *errors)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 def webcams(a: int, b: int) -> Comparison:
@@ -282,7 +233,7 @@ def webcams(a: int, b: int) -> Comparison:
         Console().print(f"{name}: {error}")
         return Comparison(name, 0, np.inf, np.nan)
     plain = adjust_plainly(found, gather_points(tracks_of_messages(found, messages), 0.34, wand))
-    ours, theirs = (1e3 * _rms(corner_errors(r, every)) for r in (found, plain))
+    ours, theirs = (1e3 * rms(corner_errors(r, every)) for r in (found, plain))
     return Comparison(name, len(found.placed()), ours, theirs)
 
 

@@ -31,8 +31,14 @@ from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import read_observations
 from fusion.recordings.arena_recording import POSE, read_recording
 from roundel import Detector, track
-from tests.benchmarks.calibration_data import gather_points, residuals_px, tracks_of_messages
-from tests.benchmarks.calibration_recordings import DATA, board_corners, corner_errors
+from tests.benchmarks.calibration_data import gather_points, residuals_px
+from tests.benchmarks.calibration_recordings import (
+    DATA,
+    board_corners,
+    corner_errors,
+    rms,
+    tracks_of_messages,
+)
 from tests.web.roundel.programs import roundel_command
 
 NEXT = re.compile(r"^next: roundel (.*)$", re.MULTILINE)
@@ -66,12 +72,12 @@ class PublicSet:
 def residual_px(rig: Rig, messages: list[Detections]) -> float:
     """RMS of the distances of all images from those of their points."""
     points = gather_points(tracks_of_messages(rig, messages), gap_s=0.0)
-    return float(np.sqrt(np.mean(residuals_px(rig, points) ** 2)))
+    return rms(residuals_px(rig, points))
 
 
 def board_mm(rig: Rig, messages: list[Detections]) -> float:
     """RMS error of the distances between the corners of the board with squares of 54 mm."""
-    return float(1e3 * np.sqrt(np.mean(corner_errors(rig, messages, SYNC_S) ** 2)))
+    return 1e3 * rms(corner_errors(rig, messages, SYNC_S))
 
 
 def caliscope_mm(data: Path) -> str:
@@ -84,7 +90,7 @@ def caliscope_mm(data: Path) -> str:
         corners = board[rows["keypoint_id"].astype(int)]
         for a, b in combinations(range(len(rows)), 2):
             errors.append(np.linalg.norm(there[a] - there[b]) - np.linalg.norm(corners[a] - corners[b]))
-    return f"{1e3 * np.sqrt(np.mean(np.square(errors))):.3f} (Caliscope)"
+    return f"{1e3 * rms(np.array(errors)):.3f} (Caliscope)"
 
 
 SETS = (

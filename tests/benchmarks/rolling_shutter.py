@@ -27,6 +27,7 @@ from fusion.model.states import States
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.calibration_honesty import clock_error
+from tests.benchmarks.calibration_recordings import rms
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
 from tests.calib.synthetic import joint_error
 from tests.fusion.rendered_arena import RenderedArena
@@ -168,7 +169,7 @@ def calibration_table(readout_ms: float, seeds: int) -> Table:
                 readouts.append([result.readout_ms - readout, result.readout_sigma_ms])
         clocks, poses = np.mean(normalized, axis=0)
         table.add_row(
-            name, *_readout_cells(np.array(readouts)), f"{_rms(offsets):.3f}", f"{clocks:.2f}", f"{poses:.2f}"
+            name, *_readout_cells(np.array(readouts)), f"{rms(offsets):.3f}", f"{clocks:.2f}", f"{poses:.2f}"
         )
     return table
 
@@ -177,11 +178,7 @@ def _readout_cells(readouts: Array) -> tuple[str, str]:
     if not readouts.size:
         return "none found", "-"
     error, sigma = np.moveaxis(readouts, 1, 0)
-    return f"{_rms(error):.2f}", f"{np.mean((error / sigma) ** 2):.2f}"
-
-
-def _rms(values: Array | list[Array]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return f"{rms(error):.2f}", f"{np.mean((error / sigma) ** 2):.2f}"
 
 
 def main() -> None:
