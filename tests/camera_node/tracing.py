@@ -174,8 +174,9 @@ def _pieces(n: int, margin: int, pieces: int) -> Array:
     return (np.arange(-margin * pieces - 1, (n + margin) * pieces + 1) + 0.5) / pieces - 0.5
 
 
-def ellipse_of(sight: Sight) -> tuple[Array, Array]:
-    """Centre (2,) and full axes (2,) in pixels of the outer edge's image, for a lens without distortion.
+def shape_of(sight: Sight) -> tuple[Array, Array]:
+    """Centre (2,) of the outer edge's image, pixels, and its shape S (2, 2), whose eigenvalues are the squared half
+    axes; for a lens without distortion.
 
     From the dual conic c c^T - r^2 (I - n n^T) of a circle of radius r around c with normal n.
     """
@@ -183,7 +184,13 @@ def ellipse_of(sight: Sight) -> tuple[Array, Array]:
     dual = sight.lens.K @ (np.outer(c, c) - r * r * (np.eye(3) - np.outer(n, n))) @ sight.lens.K.T
     dual /= dual[2, 2]
     centre = dual[:2, 2]
-    return centre, 2 * np.sqrt(np.linalg.eigvalsh(np.outer(centre, centre) - dual[:2, :2])[::-1])
+    return centre, np.outer(centre, centre) - dual[:2, :2]
+
+
+def ellipse_of(sight: Sight) -> tuple[Array, Array]:
+    """Centre (2,) and full axes (2,) of the same."""
+    centre, S = shape_of(sight)
+    return centre, 2 * np.sqrt(np.linalg.eigvalsh(S)[::-1])
 
 
 def expose(image: ArrayLike, noise: float, rng: np.random.Generator) -> Grey:

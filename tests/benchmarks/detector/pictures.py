@@ -11,7 +11,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.lens import Lens
-from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace_card
+from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, shape_of, trace_card
 
 F = 600.0  # default focal length, pixels
 NOISE = 3.0  # default noise, grey levels
@@ -110,10 +110,8 @@ def rotation_of(card: Card, size: tuple[int, int]) -> float:
     first = np.array([1.0, 0.0, 0.0]) - n[0] * n
     first /= np.linalg.norm(first)
     zero = c + r * (np.cos(card.spin) * first + np.sin(card.spin) * np.cross(n, first))
-    dual = sight.lens.K @ (np.outer(c, c) - r * r * (np.eye(3) - np.outer(n, n))) @ sight.lens.K.T
-    dual /= dual[2, 2]
-    centre = dual[:2, 2]
-    values, axes = np.linalg.eigh(np.outer(centre, centre) - dual[:2, :2])
+    centre, S = shape_of(sight)
+    values, axes = np.linalg.eigh(S)
     u, v = axes @ ((axes.T @ (sight.lens.project(zero[None])[0] - centre)) / np.sqrt(values))
     return float(np.arctan2(v, u))
 

@@ -14,7 +14,7 @@ from camera_node.detection.roundels import DetectedRoundels
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
-from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, trace
+from tests.camera_node.tracing import Sight, ellipse_of, pixels_across, shape_of, trace
 
 SIDE = 60  # of a picture that is a part of the sensor, pixels
 PINHOLE = Lens(width=SIDE, height=SIDE, fx=600.0, fy=600.0, cx=230.0, cy=-120.0)
@@ -25,11 +25,8 @@ NOISE = 3.0
 
 def picture_of(sight: Sight) -> DetectedRoundels:
     """The exact measurement of a disc through a lens without distortion, with a usual covariance."""
-    n, c, r = sight.normal, sight.position, sight.diameter_m / 2
-    dual = sight.lens.K @ (np.outer(c, c) - r * r * (np.eye(3) - np.outer(n, n))) @ sight.lens.K.T
-    dual /= dual[2, 2]
-    centre = dual[:2, 2]
-    (minor2, major2), v = np.linalg.eigh(np.outer(centre, centre) - dual[:2, :2])
+    centre, S = shape_of(sight)
+    (minor2, major2), v = np.linalg.eigh(S)
     sigma = np.array([0.006, 0.006, 0.004, 0.004, 0.004, 0.02, 0.02])
     one = np.ones(1)
     return DetectedRoundels(

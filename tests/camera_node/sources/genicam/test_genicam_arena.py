@@ -16,9 +16,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from calib.rig.camera import transform
 from camera_node.clocks.host_clock import unix_ahead_ns
 from camera_node.commands.publish import open_source
 from camera_node.foundation.arrays import Array
+from camera_node.geometry.pose import rigid_motions
 from camera_node.simulation.scene import Scene
 from camera_node.sources.frame import Source, SourceSettings
 from tests.camera_node.sources.genicam.fake_gige import FakeCamera, monotonic_of, stamp_in
@@ -44,14 +46,6 @@ def run(*words: object) -> None:
     command = [sys.executable, "-m", *map(str, words)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-
-
-def align(measured: Array, true: Array) -> Array:
-    """The measured points (N, 3) after the rigid motion that fits them best to the true ones (Kabsch)."""
-    a, b = measured - measured.mean(0), true - true.mean(0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    reflection = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return a @ (u @ reflection @ vt) + true.mean(0)
 
 
 def localize(scene: Path, folder: Path, epoch_ns: int) -> tuple[list[Array], list[Array]]:
@@ -110,7 +104,7 @@ def test_robots_before_four_gige_cameras(scene: Path, tmp_path: Path, fake_libra
         threading.Event().wait((wave_end_ns - time.time_ns()) * 1e-9 + ROBOTS_S)
     measured, true = localize(scene, tmp_path, epoch_ns)
     assert len(true) > FPS * ROBOTS_S / 2
-    rest = align(np.array(measured), np.array(true)) - np.array(true)
+    rest = transform(rigid_motions(np.array(measured), np.array(true)), measured) - np.array(true)
     stamps = np.abs(np.concatenate(list(errors.values())))
     rms_mm = 1000 * np.sqrt((rest**2).sum(1).mean())
     print(
