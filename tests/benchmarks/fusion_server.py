@@ -4,8 +4,6 @@
 `python -m fusion` runs as a separate process and receives detections over Zenoh on loopback in real time.
 """
 
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -23,9 +21,11 @@ from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import Detections, Keys, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena, Stream
+from fusion.model.robots import save_robots
 from fusion.protocol.pose_messages import FusionStatus
 from tests.benchmarks.fusion_load import START_NS, Load
 from tests.conftest import free_port
+from tests.processes import running
 
 ARENA = "load"
 DEADLINE_S = 60.0
@@ -68,17 +68,10 @@ def main(minutes: float = 10.0, robots: int = 20, cameras: int = 4, hz: float = 
 def serving(load: Load, folder: Path, endpoint: str) -> Iterator[None]:
     """A server with the load's rig and robots."""
     save_rig(Rig(cameras=load.rig), folder / "rig.yaml")
-    bodies = {name: msgspec.to_builtins(body) for name, body in load.bodies.items()}
-    (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": bodies}))
+    save_robots(load.bodies, folder / "robots.yaml")
     files = ["--rig", folder / "rig.yaml", "--robots", folder / "robots.yaml"]
-    server = subprocess.Popen(
-        [sys.executable, "-m", "fusion", "--arena", ARENA, "--listen", endpoint, *files]
-    )
-    try:
+    with running("fusion", "--arena", ARENA, "--listen", endpoint, *files):
         yield
-    finally:
-        server.terminate()
-        server.wait(DEADLINE_S)
 
 
 def publish(load: Load, session: zenoh.Session, seconds: float) -> Iterator[float]:

@@ -18,6 +18,7 @@ from camera_node.protocol.camera_requests import change_camera
 from camera_node.protocol.messages import Settings, encode
 from camera_node.protocol.registration import CameraChange, CameraRegistration, register_key
 from camera_node.protocol.requests import send_request
+from fusion.model.robots import save_robots
 from fusion.protocol.pose_messages import Robots, robots_key
 from fusion.server.arena_config import load_arena
 from tests.fusion.serving import ARENA, KEYS, serving
@@ -44,8 +45,7 @@ def main() -> None:
     (FOLDER / "arena.yaml").write_text(ARENA_YAML)
     first = Rig(cameras=ARENA.cameras)
     save_rig(first, FOLDER / "rig.yaml")
-    robots = msgspec.to_builtins({"robots": {"a": TRIANGLE}})
-    (FOLDER / "robots.yaml").write_bytes(msgspec.yaml.encode(robots))
+    save_robots({"a": TRIANGLE}, FOLDER / "robots.yaml")
     with serving(load_arena(FOLDER / "arena.yaml")) as (_, client):
         camera = CameraRegistration(id="serial-1", name="camera-1", driver="v4l2")
         send_request(client.session, register_key("test"), encode(camera), DEADLINE_S)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import IO
 
 import msgspec
 
@@ -15,6 +16,7 @@ from camera_node.foundation.config import dump_yaml
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.client.arena import Arena as Client
 from fusion.model.limits import LimitSettings
+from fusion.model.robots import save_robots
 from fusion.server.arena_config import ArenaConfig, Zone
 from fusion.server.server import Server
 from tests.conftest import ROOT
@@ -33,9 +35,7 @@ def config(folder: Path, with_rig: bool = True, lateness_ms: float = 5000) -> Ar
     Frames are sent in one burst unless a test says otherwise: every frame set waits to be complete.
     """
     save_rig(Rig(cameras=ARENA.cameras), folder / "rig.yaml")
-    (folder / "robots.yaml").write_bytes(
-        msgspec.yaml.encode({"robots": {"a": msgspec.to_builtins(TRIANGLE)}})
-    )
+    save_robots({"a": TRIANGLE}, folder / "robots.yaml")
     rig = str(folder / "rig.yaml") if with_rig else None
     return ArenaConfig(
         arena="test",
@@ -109,13 +109,14 @@ class ServerProcess:
 
     Args:
         settings: as `config` makes them.
+        log: a file, in the place of this program's standard error.
 
     Attributes:
         endpoint: on which it listens.
     """
 
-    def __init__(self, settings: ArenaConfig) -> None:
-        self._settings = settings
+    def __init__(self, settings: ArenaConfig, log: IO[str] | None = None) -> None:
+        self._settings, self._log = settings, log
         self.start()
 
     def __enter__(self) -> "ServerProcess":
@@ -131,7 +132,8 @@ class ServerProcess:
         endpoints.unlink(missing_ok=True)
         file.write_text(dump_yaml(self._settings))
         words = ["--config", str(file), "--endpoints-file", str(endpoints)]
-        self.process = subprocess.Popen([sys.executable, "-m", "fusion", *words], cwd=ROOT)
+        command = [sys.executable, "-m", "fusion", *words]
+        self.process = subprocess.Popen(command, cwd=ROOT, stderr=self._log)
         wait_for(lambda: endpoints.exists() or self.process.poll() is not None)
         assert self.process.poll() is None, "the server ended"
         (self.endpoint,) = endpoints.read_text().split()
@@ -144,9 +146,11 @@ class ServerProcess:
 
 
 @contextmanager
-def serving_process(settings: ArenaConfig) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+def serving_process(
+    settings: ArenaConfig, log: IO[str] | None = None
+) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """A server in a process of its own, and the endpoint on which it listens; SIGTERM must end it with exit code 0."""
-    with ServerProcess(settings) as server:
+    with ServerProcess(settings, log) as server:
         yield server.endpoint, server.process
         server.process.terminate()
         assert server.process.wait(DEADLINE_S) == 0

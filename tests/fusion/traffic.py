@@ -1,27 +1,23 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A server in its own process, and cameras that publish a synthetic arena in real time, well-behaved or not."""
+"""Cameras that publish a synthetic arena in real time, well-behaved or not."""
 
-import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import cycle
-from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from calib.rig.rig import Rig, save_rig
 from camera_node.detection.roundels import Roundels
 from camera_node.protocol.messages import MAX_ROUNDELS, Detections, Keys, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena as Client
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
 from tests.fusion.serving import ARENA
-from tests.processes import running
-from tests.waiting import Inbox, wait_for
+from tests.waiting import Inbox, in_thread
 
 KEYS = Keys("test")
 HZ = 30.0
@@ -29,58 +25,27 @@ MOST_TRUE = 16  # roundels of the arena in one frame
 Alter = Callable[[Detections], Detections]
 
 
-@dataclass
-class RunningServer:
-    """A server process: its endpoint and its log."""
-
-    process: subprocess.Popen
-    endpoint: str
-    log: Path
-
-
-@contextmanager
-def server_process(folder: Path, *options: str) -> Iterator[RunningServer]:
-    """`python -m fusion` with the rig and the robots of the synthetic arena."""
-    save_rig(Rig(cameras=ARENA.cameras), folder / "rig.yaml")
-    robots = {name: msgspec.to_builtins(robot) for name, robot in ARENA.robots.items()}
-    (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": robots}))
-    endpoints, log = folder / "endpoints", folder / "server.log"
-    files = ["--rig", folder / "rig.yaml", "--robots", folder / "robots.yaml", "--endpoints-file", endpoints]
-    words = ["--arena", "test", "--listen", "tcp/127.0.0.1:0", *files, *options]
-    with log.open("w") as stderr, running("fusion", *words, stderr=stderr) as process:
-        wait_for(lambda: process.poll() is not None or endpoints.exists())
-        yield RunningServer(process, endpoints.read_text().split()[0], log)
-
-
-class PublishingCamera:
+def publishing_camera(
+    endpoint: str, name: str, hz: float = HZ, alter: Alter = lambda m: m
+) -> AbstractContextManager[None]:
     """A camera that publishes its frames of the arena in real time, in a thread and a session of its own."""
+    messages = [m for m in ARENA.messages(4) if m.camera == name]
+    stopped = threading.Event()
 
-    def __init__(self, endpoint: str, name: str, hz: float = HZ, alter: Alter = lambda m: m) -> None:
-        self._endpoint, self._name, self._hz, self._alter = endpoint, name, hz, alter
-        self._messages = [m for m in ARENA.messages(4) if m.camera == name]
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._publish)
-
-    def __enter__(self) -> "PublishingCamera":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._stopped.set()
-        self._thread.join()
-
-    def _publish(self) -> None:
-        with open_client([self._endpoint]) as session:
-            publisher = session.declare_publisher(KEYS.detections(self._name))
+    def publish() -> None:
+        with open_client([endpoint]) as session:
+            publisher = session.declare_publisher(KEYS.detections(name))
             seq, due_s = 0, time.monotonic()
-            while not self._stopped.wait(max(0.0, due_s - time.monotonic())):
-                due_s = max(due_s + 1 / self._hz, time.monotonic() - 1 / self._hz)  # no burst after a delay
+            while not stopped.wait(max(0.0, due_s - time.monotonic())):
+                due_s = max(due_s + 1 / hz, time.monotonic() - 1 / hz)  # no burst after a delay
                 now_ns = time.time_ns()
                 message = msgspec.structs.replace(
-                    self._messages[seq % len(self._messages)], seq=seq, t_ns=now_ns, sent_ns=now_ns
+                    messages[seq % len(messages)], seq=seq, t_ns=now_ns, sent_ns=now_ns
                 )
-                publisher.put(encode(self._alter(message)))
+                publisher.put(encode(alter(message)))
                 seq += 1
+
+    return in_thread(publish, stopped.set)
 
 
 @dataclass

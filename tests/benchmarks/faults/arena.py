@@ -13,6 +13,7 @@ import msgspec
 from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
 from fusion.client.arena import Arena as Client
+from fusion.model.robots import save_robots
 from fusion.protocol.pose_messages import FusionStatus
 from tests.benchmarks.faults.judge import PoseJudge
 from tests.benchmarks.faults.network import Loopback
@@ -198,8 +199,7 @@ class LiveArena:
     def _write_files(self) -> None:
         folder = self.folder
         save_rig(Rig(cameras=self.rig), folder / "rig.yaml")
-        bodies = {name: msgspec.to_builtins(body) for name, body in self.load.bodies.items()}
-        write(folder / "robots.yaml", {"robots": bodies})
+        save_robots(self.load.bodies, folder / "robots.yaml")
         files = {"rig": "rig.yaml", "saved_rig": "saved_rig.yaml", "robots": "robots.yaml"}
         files |= {"saved_robots": "saved_robots.yaml"}
         write(folder / "arena.yaml", {"arena": ARENA, "listen": [self.endpoint], **files})

@@ -13,7 +13,7 @@ from calib.rig.rig import Rig, save_rig
 from camera_node.sources.recorded_detections import write_observations
 from fusion.commands.run import run
 from fusion.export.pose_formats import COLUMNS
-from fusion.model.robots import Robot
+from fusion.model.robots import Robot, save_robots
 from tests.fusion.synthetic import SINGLE, TRIANGLE, Arena, line
 from tests.processes import run_program
 from tests.truth import true_camera
@@ -25,15 +25,11 @@ ARENA = Arena(
 )
 
 
-def write_robots(path: Path, robots: dict[str, Robot]) -> None:
-    path.write_bytes(msgspec.yaml.encode({"robots": msgspec.to_builtins(robots)}))
-
-
 @pytest.fixture
 def recording(tmp_path) -> dict[str, Path]:
     files = {name: tmp_path / name for name in ("rig", "robots", "observations", "out")}
     save_rig(Rig(cameras=ARENA.cameras), files["rig"])
-    write_robots(files["robots"], ARENA.robots)
+    save_robots(ARENA.robots, files["robots"])
     write_observations(files["observations"], ARENA.messages(20))
     return files
 
@@ -90,7 +86,7 @@ def test_a_recording_of_another_renderer(shared_data, tmp_path):
     size = truth["robots"]["outer_diameter_m"]
     markers = truth["robots"]["markers_m"]
     robots = {name: Robot(diameter_m=size, markers=tuple(map(tuple, m))) for name, m in markers.items()}
-    write_robots(tmp_path / "robots.yaml", robots)
+    save_robots(robots, tmp_path / "robots.yaml")
     run(
         rig=tmp_path / "rig.yaml",
         robots=tmp_path / "robots.yaml",

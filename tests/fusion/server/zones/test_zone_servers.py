@@ -12,6 +12,7 @@ import pytest
 from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import decode
 from fusion.model.limits import LimitSettings
+from fusion.model.robots import save_robots
 from fusion.protocol.pose_messages import Markers, RobotPose, Vector
 from fusion.protocol.zone_messages import zone_key
 from fusion.server.arena_config import ArenaConfig
@@ -38,7 +39,7 @@ GAP_NS, AWAY_NS = 50_000_000, 1_000_000_000
 def settings(folder: Path, endpoint: str) -> ArenaConfig:
     """Of both servers; frame sets wait until they are complete."""
     save_rig(Rig(cameras=hall(4)), folder / "rig.yaml")
-    (folder / "robots.yaml").write_bytes(msgspec.yaml.encode({"robots": msgspec.to_builtins(ROBOTS)}))
+    save_robots(ROBOTS, folder / "robots.yaml")
     return ArenaConfig(
         arena="test",
         listen=(endpoint,),
