@@ -22,6 +22,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
+import msgspec
 import numpy as np
 import psutil
 import tyro
@@ -29,13 +30,14 @@ import viser
 import zenoh
 from websockets.sync.client import connect
 
-from camera_node.protocol.messages import CameraStatus, Keys, Preview, decode, encode
+from camera_node.protocol.messages import Keys, Preview, decode, encode
 from camera_node.protocol.session import open_client
 from fusion.client.arena import Arena
 from fusion.protocol.pose_messages import RobotPoses
 from tests.benchmarks.fusion_load import LENS, Load
 from tests.benchmarks.fusion_server import ARENA, DEADLINE_S, publish, serving
 from tests.conftest import free_port
+from tests.messages import NODE
 from tests.waiting import in_thread, wait_for, wait_for_port
 
 LIMIT = 0.30  # of a core
@@ -198,19 +200,7 @@ def picture_messages(load: Load) -> list[tuple[str, bytes]]:
     messages = []
     for name in load.rig:
         preview = Preview(camera=name, t_ns=time.time_ns(), width=width, height=height, jpeg=jpeg)
-        status = CameraStatus(
-            camera=name,
-            t_ns=time.time_ns(),
-            fps=load.hz,
-            frames=100,
-            dropped=0,
-            detect_ms=0.7,
-            roundels=100.0,
-            saturated=0.0,
-            clock_offset_ms=0.0,
-            width=width,
-            height=height,
-        )
+        status = msgspec.structs.replace(NODE, camera=name, t_ns=time.time_ns(), width=width, height=height)
         messages += [(keys.preview(name), encode(preview)), (keys.camera_status(name), encode(status))]
     return messages
 

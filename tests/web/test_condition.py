@@ -2,7 +2,6 @@
 """The status line names the worst fault and what to do; the next step follows the order of the work."""
 
 import re
-import time
 from dataclasses import replace
 
 import msgspec
@@ -10,6 +9,7 @@ import pytest
 
 from camera_node.protocol.server_connection import ServerConnection
 from fusion.protocol.pose_messages import Contradiction, FusionStatus
+from tests.messages import STATUS
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.colours import own_colours, robot_colour
@@ -152,17 +152,7 @@ def test_the_steps_are_in_the_order_of_the_work(arena: LiveArena, feed: Feed):
     arena.rig(four_cameras())
     wait_for(lambda: feed.state().rig)
     state = feed.state()
-    none = FusionStatus(
-        t_ns=time.time_ns(),
-        frame_sets_per_s=1,
-        latency_ms=None,
-        cpu=0,
-        memory_mb=1,
-        cameras={},
-        robots={},
-        faults={},
-    )
-    state.status, state.server_alive = TimedMessage(none, state.now_s), True
+    state.status, state.server_alive = TimedMessage(STATUS, state.now_s), True
     assert state.rig is not None
     by_wand = msgspec.structs.replace(state.rig, calibration={"grade": "B"})
     floor = replace(state, rig=by_wand)

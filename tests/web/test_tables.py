@@ -9,8 +9,8 @@ import numpy as np
 
 from calib.rig.coverage import cell_centres
 from calib.rig.rig import Rig
-from camera_node.protocol.messages import CameraStatus
-from fusion.protocol.pose_messages import CameraHealth, Contradiction, FusionStatus
+from fusion.protocol.pose_messages import CameraHealth, Contradiction
+from tests.messages import HEALTH, NODE, STATUS
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena, four_cameras
 from web.colours import css, robot_colour
@@ -42,41 +42,11 @@ def test_the_tables_show_what_was_sent(arena: LiveArena, feed: Feed):
 
 def test_an_unused_camera_has_a_note():
     """Offline, not calibrated, moved, or a duplicate name; else the advice of its node."""
-    health = CameraHealth(
-        fps=30.0,
-        lateness_ms=5.0,
-        residual_px=None,
-        assigned=0,
-        unassigned=0,
-        late=0,
-        calibrated=True,
-        excluded=True,
-    )
-    own = CameraStatus(
-        camera="north",
-        t_ns=0,
-        width=640,
-        height=480,
-        fps=30.0,
-        frames=1,
-        dropped=0,
-        detect_ms=0.5,
-        roundels=0.0,
-        saturated=0.0,
-        advice="too dark",
-    )
+    health = msgspec.structs.replace(HEALTH, excluded=True)
+    own = msgspec.structs.replace(NODE, advice="too dark")
 
     def advice(health: CameraHealth, now: float = 0.0, rig: Rig | None = None) -> str:
-        status = FusionStatus(
-            t_ns=0,
-            frame_sets_per_s=30.0,
-            latency_ms=None,
-            cpu=0.1,
-            memory_mb=100.0,
-            cameras={"north": health},
-            robots={},
-            faults={},
-        )
+        status = msgspec.structs.replace(STATUS, cameras={"north": health})
         state = ArenaState(
             now_s=now,
             cameras={"north": TimedMessage(own, 0.0)},

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 
+import msgspec
 import numpy as np
 import zenoh
 
@@ -17,6 +18,7 @@ from camera_node.protocol.session import open_router
 from fusion.model.limits import Limits
 from fusion.protocol.pose_messages import FusionStatus, RobotPose, RobotPoses
 from tests.conftest import ROOT
+from tests.messages import STATUS
 from tests.processes import first_line, killed_at_end, running
 from tests.waiting import DEADLINE_S, wait_for
 
@@ -50,17 +52,7 @@ def moving_pose(robot: str, t_ns: int, seed: int = 1, state: str = "tracked") ->
 
 def status(t_ns: int, limits: Limits) -> FusionStatus:
     """The status of a server without cameras."""
-    return FusionStatus(
-        t_ns=t_ns,
-        frame_sets_per_s=RATE_HZ,
-        latency_ms=None,
-        cpu=0.0,
-        memory_mb=0.0,
-        cameras={},
-        robots={},
-        faults={},
-        limits=limits,
-    )
+    return msgspec.structs.replace(STATUS, t_ns=t_ns, frame_sets_per_s=RATE_HZ, limits=limits)
 
 
 def publish_poses(session: zenoh.Session, poses: Sequence[RobotPose]) -> None:

@@ -11,9 +11,9 @@ from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.pose import rotation_from_vector, rotation_from_wxyz, wxyz_from_rotation
 from fusion.bridges.mavlink_frames import FrdFrames, roll_pitch_yaw
 from fusion.bridges.mavlink_vehicle import MavlinkVehicle, RateDivider, ResetCounter
-from fusion.protocol.pose_messages import FusionStatus
 from tests.fusion.bridges.autopilot import Autopilot
 from tests.fusion.bridges.pose_server import PoseServer, bridge, moving_pose, restart
+from tests.messages import STATUS
 from tests.missing_package import advice_without
 from tests.waiting import wait_for
 
@@ -163,19 +163,7 @@ def test_resets_count_losses_gaps_and_calibrations():
     counter.add_pose(moving_pose("rover", 6 * second))
     assert counter.count == 2
     for rig_t_ns, expected in ((None, 2), (10, 2), (10, 2), (None, 2), (11, 3)):
-        counter.add_status(
-            FusionStatus(
-                t_ns=0,
-                frame_sets_per_s=0,
-                latency_ms=None,
-                cpu=0,
-                memory_mb=0,
-                cameras={},
-                robots={},
-                faults={},
-                rig_t_ns=rig_t_ns,
-            )
-        )
+        counter.add_status(msgspec.structs.replace(STATUS, rig_t_ns=rig_t_ns))
         assert counter.count == expected
     counter.count = 255
     counter.add_pose(moving_pose("rover", 9 * second))

@@ -18,28 +18,16 @@ from fusion.protocol.pose_messages import CameraHealth, FusionStatus
 from fusion.server.server import Server
 from tests.conftest import free_port
 from tests.fusion.serving import ARENA, config, later, send, send_until_tracked, serving
+from tests.messages import HEALTH, STATUS
 from tests.waiting import DEADLINE_S, wait_for
 
-SENDING = CameraHealth(
-    fps=30, lateness_ms=5, residual_px=None, assigned=0, unassigned=0, late=0, calibrated=True
-)
-SILENT = msgspec.structs.replace(SENDING, fps=0.0)
-NEW = msgspec.structs.replace(SENDING, calibrated=False)
+SILENT = msgspec.structs.replace(HEALTH, fps=0.0)
+NEW = msgspec.structs.replace(HEALTH, calibrated=False)
 ROBOTS = {"rover": "tracked", "drone": "coasting"}
 
 
 def status(cameras: dict[str, CameraHealth], robots: dict, not_acquired: dict[str, str]) -> FusionStatus:
-    return FusionStatus(
-        t_ns=0,
-        frame_sets_per_s=0,
-        latency_ms=None,
-        cpu=0,
-        memory_mb=0,
-        cameras=cameras,
-        robots=robots,
-        faults={},
-        not_acquired=not_acquired,
-    )
+    return msgspec.structs.replace(STATUS, cameras=cameras, robots=robots, not_acquired=not_acquired)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +36,7 @@ def status(cameras: dict[str, CameraHealth], robots: dict, not_acquired: dict[st
         ({}, {}, {}, "rover", "no camera runs: start roundel camera on its machine"),
         ({"b": SILENT, "a": SILENT}, {}, {}, None, r"no camera sends frames \(a, b\): check"),
         ({"a": SILENT}, ROBOTS, {}, "rovr", r"no robot 'rovr', but drone, rover; did you mean rover\?"),
-        ({"a": SENDING}, ROBOTS, {}, "cart", r"no robot 'cart', but drone, rover$"),
+        ({"a": HEALTH}, ROBOTS, {}, "cart", r"no robot 'cart', but drone, rover$"),
         (
             {"a": SILENT, "b": NEW},
             ROBOTS,
@@ -56,11 +44,11 @@ def status(cameras: dict[str, CameraHealth], robots: dict, not_acquired: dict[st
             "rover",
             r"frames is calibrated \(b\): run roundel calibrate wand",
         ),
-        ({"a": SENDING}, {}, {}, "rover", "no robot is declared: use roundel define"),
-        ({"a": SENDING}, {}, {"cart": "2 of 3 seen"}, "cart", "robot cart is not found: 2 of 3 seen"),
-        ({"a": SENDING}, ROBOTS, {}, "drone", "robot drone is coasting: are its markers in view"),
-        ({"a": SENDING}, ROBOTS, {}, "rover", "^$"),
-        ({"a": SENDING}, ROBOTS, {}, None, "^$"),
+        ({"a": HEALTH}, {}, {}, "rover", "no robot is declared: use roundel define"),
+        ({"a": HEALTH}, {}, {"cart": "2 of 3 seen"}, "cart", "robot cart is not found: 2 of 3 seen"),
+        ({"a": HEALTH}, ROBOTS, {}, "drone", "robot drone is coasting: are its markers in view"),
+        ({"a": HEALTH}, ROBOTS, {}, "rover", "^$"),
+        ({"a": HEALTH}, ROBOTS, {}, None, "^$"),
     ],
 )
 def test_the_cause_is_the_first_thing_that_is_missing(cameras, robots, not_acquired, robot, says):
@@ -69,7 +57,7 @@ def test_the_cause_is_the_first_thing_that_is_missing(cameras, robots, not_acqui
 
 
 def test_markers_need_no_robot():
-    assert why_no_markers(status({"a": SENDING}, {}, {})) == ""
+    assert why_no_markers(status({"a": HEALTH}, {}, {})) == ""
 
 
 @pytest.fixture(scope="module")

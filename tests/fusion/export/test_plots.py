@@ -14,8 +14,9 @@ from camera_node.protocol.messages import encode
 from fusion.commands.plot import plot
 from fusion.export import plots
 from fusion.export.plots import compare_positions, draw_comparison, draw_recording, read_curves
-from fusion.protocol.pose_messages import CameraHealth, FusionStatus, RobotPose
+from fusion.protocol.pose_messages import RobotPose
 from tests.fusion.bridges.pose_server import moving_pose
+from tests.messages import HEALTH, STATUS
 
 START_NS, N = 1_790_000_000_000_000_000, 100
 LOST = range(40, 60)
@@ -31,24 +32,13 @@ def recorded_poses(robot: str, seed: int, offset_m: float = 0.0) -> list[RobotPo
 
 
 def write_recording(path: Path, robots: dict[str, int], offset_m: float = 0.0) -> Path:
-    health = CameraHealth(
-        fps=50, lateness_ms=5, residual_px=0.1, assigned=4, unassigned=0, late=0, calibrated=True
-    )
     with RecordingWriter(path) as writer:
         for robot, seed in robots.items():
             for pose in recorded_poses(robot, seed, offset_m):
                 writer.put(f"x/robot/{robot}/pose", encode(pose), pose.t_ns)
         for k, residual in enumerate([0.1, None, 0.3]):
-            status = FusionStatus(
-                t_ns=START_NS + k * 10**9,
-                frame_sets_per_s=50,
-                latency_ms=10,
-                cpu=0.1,
-                memory_mb=100,
-                cameras={"north": msgspec.structs.replace(health, residual_px=residual)},
-                robots={},
-                faults={},
-            )
+            cameras = {"north": msgspec.structs.replace(HEALTH, residual_px=residual)}
+            status = msgspec.structs.replace(STATUS, t_ns=START_NS + k * 10**9, cameras=cameras)
             writer.put("x/fusion/status", encode(status), status.t_ns)
         writer.put("x/fusion/status", b"\xc1", START_NS)
     return path
