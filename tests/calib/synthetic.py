@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A synthetic arena: a ring of cameras, a wand on a smooth path, and the detections of an ideal detector."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
+from scipy.stats import chi2
 
 from calib.rig.camera import Camera
 from calib.rig.rig import Rig
@@ -247,6 +249,27 @@ def joint_error(result: WandCalibration, truth: Rig) -> tuple[float, int]:
         CameraPoses(result.names, there, np.zeros_like(result.covariance)),
     )
     return agreement.chi2, agreement.degrees
+
+
+def assert_honest(results: Iterable[tuple[WandCalibration, Rig]], exactly: bool = False) -> None:
+    """Assert that the squared Mahalanobis errors of all poses, summed over calibrations with their true rigs, are below
+    the 99.9 % quantile of chi-square; with `exactly` also above its 0.1 % quantile."""
+    squared, degrees = np.sum([joint_error(*pair) for pair in results], axis=0)
+    low, high = chi2.ppf([0.001, 0.999], degrees)
+    assert squared < high
+    assert squared > low or not exactly
+
+
+def clock_errors_ms(result: WandCalibration, truth: Rig) -> Array:
+    """(C,) errors of the time offsets, ms, less their mean: an offset that all clocks share is not observable."""
+    off = result.time_offset_ms - [truth.cameras[name].time_offset_ms for name in result.names]
+    return off - off.mean()
+
+
+def camera_distances(rig: Rig, names: Iterable[str]) -> Array:
+    """(C, C) distances between cameras, metres."""
+    places = np.array([rig.cameras[name].matrix()[:3, 3] for name in names])
+    return np.linalg.norm(places[:, None] - places, axis=2)
 
 
 def random_covariance(cameras: int, rng: np.random.Generator) -> Array:
