@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.recording import as_they_arrived, read_messages
+from calib.rig.recording import as_they_arrived, read_decoded, read_messages
 from calib.rig.rig import Rig
 from camera_node.detection.detector import SettingKeywords
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
-from camera_node.protocol.messages import Detections, MessageError, decode
+from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import detect_frames, detect_video, read_observations
 from camera_node.sources.recorded_frames import VIDEOS
 from fusion.export.plots import draw_recording, read_curves
@@ -234,16 +234,7 @@ class Recording:
 
     def _decoded(self, suffix: str, kind: type) -> Iterator[tuple[int, Any]]:
         """Yield the time of arrival and the content of the messages on keys that end with `suffix`."""
-        if not self.is_mcap:
-            return
-        for key, data, received_ns in read_messages(self.path, self.faults):
-            if key.endswith(suffix):
-                try:
-                    message = decode(data, kind)
-                except MessageError:
-                    self.faults[f"undecodable messages on {key}"] += 1
-                    continue
-                yield received_ns, message
+        return read_decoded(self.path, {suffix: kind}, self.faults) if self.is_mcap else iter(())
 
     def arrivals(self, rig: Rig | None = None) -> Iterator[tuple[int, Detections]]:
         """Yield the time of arrival (ns) and the message of each frame.

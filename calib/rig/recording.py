@@ -13,7 +13,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from mcap.records import Channel, Chunk
 from mcap.writer import IndexType, Writer
@@ -163,6 +163,32 @@ def read_messages(
         raise ConfigError(f"{path} can't be read: {error.strerror}; check the path") from None
 
 
+def read_decoded(
+    path: Path, kinds: Mapping[str, type], faults: Counter[str], names: Mapping[str, str] | None = None
+) -> Iterator[tuple[int, Any]]:
+    """Yield time of arrival (ns) and content of the messages of some kinds, in the order of arrival.
+
+    Args:
+        path: the MCAP file.
+        kinds: of the messages, by the ends of their keys.
+        faults: is given what was skipped: see `read_messages`; and messages that can't be decoded.
+        names: of these in `faults`, by the ends of their keys; unless given, they are named by their keys.
+
+    Raises:
+        ConfigError: the file is missing, or not an MCAP file.
+    """
+    for key, data, received_ns in read_messages(path, faults):
+        end = next((end for end in kinds if key.endswith(end)), None)
+        if end is None:
+            continue
+        try:
+            message = decode(data, kinds[end])
+        except MessageError:
+            faults[(names or {}).get(end, f"undecodable messages on {key}")] += 1
+            continue
+        yield received_ns, message
+
+
 @contextlib.contextmanager
 def new_recording(path: Path, overwrite: bool = True) -> Iterator[RecordingWriter]:
     """A writer of a recording that appears at `path` complete at the end, or not at all after an error.
@@ -204,14 +230,8 @@ def read_detections(path: Path) -> list[Detections]:
     Raises:
         ConfigError: the file is missing, not an MCAP recording, or holds no detections.
     """
-    messages, faults = [], Counter[str]()
-    for key, data, _ in read_messages(path, faults):
-        if not key.endswith("/detections"):
-            continue
-        try:
-            messages.append(decode(data, Detections))
-        except MessageError:
-            faults["invalid detections"] += 1
+    faults, names = Counter[str](), {"/detections": "invalid detections"}
+    messages = [found for _, found in read_decoded(path, {"/detections": Detections}, faults, names)]
     for reason, count in faults.items():
         LOG.warning("%s: skipped %d %s", path, count, reason)
     if not messages:

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib.rig.camera import Camera
-from calib.rig.recording import read_messages
+from calib.rig.recording import read_decoded
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import new_path
 from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.extras import require
-from camera_node.protocol.messages import MessageError, decode
 from fusion.export.recorded_poses import MM, RecordedPoses
 from fusion.protocol.pose_messages import FusionStatus, RobotPose
 
@@ -98,9 +97,10 @@ def read_curves(path: Path, robots: Sequence[str] = ()) -> RecordedCurves:
     for pose in poses:
         curves.robots.setdefault(pose.robot, Curve()).add(pose.t_ns, _row(pose))
     curves.cameras = poses.cameras
-    for key, data, _ in read_messages(path, poses.faults):
-        if key.endswith("/fusion/status"):
-            _add_residuals(curves.residuals, data)
+    for _, status in read_decoded(path, {"/fusion/status": FusionStatus}, Counter()):
+        for camera, health in status.cameras.items():
+            row = [np.nan if health.residual_px is None else health.residual_px]
+            curves.residuals.setdefault(camera, Curve()).add(status.t_ns, row)
     return curves
 
 
@@ -109,16 +109,6 @@ def _row(pose: RobotPose) -> list[float]:
         return [np.nan] * 6
     variances = pose.covariance_matrix.diagonal()[3:6]
     return [*pose.position, *np.sqrt(np.maximum(variances, 0.0))]
-
-
-def _add_residuals(residuals: dict[str, Curve], data: bytes) -> None:
-    try:
-        status = decode(data, FusionStatus)
-    except MessageError:
-        return
-    for camera, health in status.cameras.items():
-        row = [np.nan if health.residual_px is None else health.residual_px]
-        residuals.setdefault(camera, Curve()).add(status.t_ns, row)
 
 
 def draw_recording(curves: RecordedCurves) -> "Figure":

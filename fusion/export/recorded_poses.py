@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from calib.rig.camera import Camera
-from calib.rig.recording import read_messages
+from calib.rig.recording import read_decoded
 from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
-from camera_node.protocol.messages import MessageError, decode
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import RobotPose, Robots
 
 MM = 1000.0  # in a metre
+KINDS = {"/robots": Robots, "/rig": RigMessage, "/pose": RobotPose}
 
 
 class RecordedPoses:
@@ -46,17 +46,18 @@ class RecordedPoses:
         """
         self.counts.clear()
         last_ns: dict[str, int] = {}
-        for key, data, _ in read_messages(self.path, self.faults):
-            if key.endswith(("/robots", "/rig")):
-                self._add_arena(key, data)
-            if not key.endswith("/pose") or (pose := self._decode(data)) is None:
-                continue
-            if pose.t_ns <= last_ns.get(pose.robot, -1):
-                self.faults["poses that are not later than the one before"] += 1
-                continue
-            last_ns[pose.robot] = pose.t_ns
-            self.counts[pose.robot] += 1
-            yield pose
+        for _, message in read_decoded(self.path, KINDS, self.faults, {"/pose": "undecodable poses"}):
+            if isinstance(message, Robots):
+                self.bodies = message.robots
+            elif isinstance(message, RigMessage):
+                self.cameras = message.rig.cameras
+            elif not self._robots or message.robot in self._robots:
+                if message.t_ns <= last_ns.get(message.robot, -1):
+                    self.faults["poses that are not later than the one before"] += 1
+                    continue
+                last_ns[message.robot] = message.t_ns
+                self.counts[message.robot] += 1
+                yield message
         self._check()
 
     def _check(self) -> None:
@@ -69,20 +70,3 @@ class RecordedPoses:
             )
         if missing := sorted(self._robots - set(self.counts)):
             raise ConfigError(f"{self.path} holds no poses of {', '.join(missing)}; check --robots")
-
-    def _decode(self, data: bytes) -> RobotPose | None:
-        try:
-            pose = decode(data, RobotPose)
-        except MessageError:
-            self.faults["undecodable poses"] += 1
-            return None
-        return pose if not self._robots or pose.robot in self._robots else None
-
-    def _add_arena(self, key: str, data: bytes) -> None:
-        try:
-            if key.endswith("/robots"):
-                self.bodies = decode(data, Robots).robots
-            else:
-                self.cameras = decode(data, RigMessage).rig.cameras
-        except MessageError:
-            self.faults[f"undecodable messages on {key}"] += 1

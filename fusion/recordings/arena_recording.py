@@ -20,7 +20,7 @@ from typing import Any
 
 import zenoh
 
-from calib.rig.recording import RecordingWriter, read_messages
+from calib.rig.recording import RecordingWriter, read_decoded, read_messages
 from calib.rig.rig import Rig
 from calib.rig.rig_messages import RigMessage
 from camera_node.foundation.errors import ConfigError
@@ -71,11 +71,8 @@ class ArenaRecording:
 
         Each call reads the file, which may be larger than the memory.
         """
-        for key, data, received_ns in read_messages(self.path, Counter()) if self.path else ():
-            for suffix in suffixes:
-                if key.endswith(suffix):
-                    with contextlib.suppress(MessageError):  # counted when the recording was read first
-                        yield received_ns, decode(data, KINDS[suffix])
+        if self.path:  # faults were counted when the recording was read first
+            yield from read_decoded(self.path, {suffix: KINDS[suffix] for suffix in suffixes}, Counter())
 
     def add(self, key: str, data: bytes) -> None:
         """Take a recorded message; count it, or the fault if it can't be decoded."""
