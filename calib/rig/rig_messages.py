@@ -140,7 +140,7 @@ def _renamed(old: dict[str, Camera], new: dict[str, Camera]) -> dict[str, str]:
 
 def _describe_motion(old: dict[str, Camera], new: dict[str, Camera]) -> list[str]:
     both = sorted(new.keys() & old.keys())
-    moved = {name: mm for name in both if (mm := _moved_mm(old[name], new[name])) > MOVED_MM}
+    moved = {name: mm for name in both if (mm := moved_mm(old[name], new[name])) > MOVED_MM}
     if len(moved) > 1 and _is_one_motion([old[name] for name in both], [new[name] for name in both]):
         return ["floor and origin"]
     most = sorted(moved, key=moved.__getitem__, reverse=True)
@@ -148,7 +148,8 @@ def _describe_motion(old: dict[str, Camera], new: dict[str, Camera]) -> list[str
     return parts + ([f"{len(moved) - MAX_NAMED} more"] if len(moved) > MAX_NAMED else [])
 
 
-def _moved_mm(old: Camera, new: Camera) -> float:
+def moved_mm(old: Camera, new: Camera) -> float:
+    """How far the position of a camera differs between two rigs."""
     return 1e3 * float(np.linalg.norm(new.matrix()[:3, 3] - old.matrix()[:3, 3]))
 
 

@@ -18,7 +18,7 @@ from camera_node.detection.overlay import draw_refused, draw_roundels
 from camera_node.detection.refusals import RefusedRing, explain
 from camera_node.detection.roundels import Roundel, Roundels
 from camera_node.foundation.arrays import Grey
-from camera_node.foundation.errors import CameraError, ConfigError, describe_failed_write
+from camera_node.foundation.errors import CameraError, ConfigError, unwritable
 from camera_node.foundation.terminal import console, say
 from camera_node.geometry.lens import Lens, load_lens
 from camera_node.sources.recorded_frames import read_grey
@@ -156,7 +156,7 @@ def _make_folder(path: Path, n_images: int) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{path} can't be written: {describe_failed_write(error)}") from None
+        raise unwritable(path, error) from None
 
 
 def _draw(image: Grey, roundels: Roundels, refused: list[RefusedRing], to: Path) -> None:

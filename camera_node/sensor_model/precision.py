@@ -24,8 +24,8 @@ ACROSS_POINTS = 8  # of the quadrature across an edge
 LEVEL_WIDTH = 2.5  # blurs from an edge up to which pixels determine the grey levels
 PIXEL_VARIANCE = 1 / 12  # of a pixel's own width, square pixels
 ROUNDING = 1 / 12  # variance of rounding to 8 bits, square grey levels
-# Columns of the information matrix: position, normal, ratio d_i / d_o, and the grey levels of paper and ink.
-POSITION, NORMAL, RATIO, BRIGHT, DARK = slice(0, 3), slice(3, 5), 5, 6, 7
+# Columns of the information matrix: position, two of the normal, ratio d_i / d_o, and the grey levels of paper and ink.
+POSITION, RATIO, BRIGHT = slice(0, 3), 5, 6
 UNKNOWNS = 8
 
 
@@ -39,15 +39,12 @@ class PredictedPrecision:
         ellipse_cov_px: (N, 2, 2) covariance of the outer ellipse's centre, which detections hold, square pixels. Unlike
             the disc's own centre it does not depend on the normal's uncertainty.
         distance_sigma_m: (N,) standard deviation of the distance from the camera, metres.
-        normal_sigma_rad: (N,) of the normal about its worse axis, given the right one of both solutions; at most
-            `NORMAL_SIGMA`. To first order: the normal of a frontal roundel is better than this.
     """
 
     position_cov: Array
     centre_cov_px: Array
     ellipse_cov_px: Array
     distance_sigma_m: Array
-    normal_sigma_rad: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,5 +203,4 @@ def _summarize(cov: Array, position: Array, J: Array, to_ellipse: Array) -> Pred
         J @ p @ J.mT,
         to_ellipse @ cov[:, :5, :5] @ to_ellipse.mT,
         np.sqrt(np.einsum("ni,nij,nj->n", line, p, line)),
-        np.sqrt(np.linalg.eigvalsh(cov[:, NORMAL, NORMAL])[:, -1]),
     )

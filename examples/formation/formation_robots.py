@@ -17,7 +17,7 @@ from camera_node.foundation.arrays import Array, Grey
 from camera_node.geometry.body import Body
 from camera_node.geometry.pose import invert
 from camera_node.simulation.discs import place_discs
-from camera_node.simulation.floor import Picture, paint_floor
+from camera_node.simulation.floor import Picture
 from camera_node.simulation.renderer import ImageModel
 from camera_node.simulation.scene import SceneCamera
 
@@ -175,18 +175,13 @@ def _mean(a: Array, b: Array, share: float) -> Array:
     return np.array([*(a + share * change)[:2], wrap(a[2] + share * change[2])])
 
 
-def paint_background(seed: int = 0) -> Picture:
-    """The cluttered floor of the arena."""
-    return paint_floor(seed)
-
-
 class RobotCamera:
     """The camera of one robot; it sees the roundels of the others.
 
     Args:
         world: the robots.
         name: the robot's.
-        floor: from `paint_background`.
+        floor: from `paint_floor`.
     """
 
     def __init__(self, world: RobotWorld, name: str, floor: Picture) -> None:

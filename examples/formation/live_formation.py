@@ -28,6 +28,7 @@ from camera_node.geometry.pose import Pose
 from camera_node.node.node import Node, NodeOptions
 from camera_node.protocol.messages import RelativePositions, encode
 from camera_node.protocol.session import listening_endpoints, open_router
+from camera_node.simulation.floor import paint_floor
 from camera_node.sources.frame import Frame, Source
 from formation.formation_control import BLIND_S, Controller, Follower, Leader, place_of
 from formation.formation_robots import (
@@ -40,7 +41,6 @@ from formation.formation_robots import (
     camera_matrix,
     compose,
     light,
-    paint_background,
     roundel_matrix,
 )
 from fusion.client import Arena
@@ -363,7 +363,7 @@ def _start_robots(
     stack: contextlib.ExitStack, router: zenoh.Session, arena: Arena, world: RobotWorld, clock: WorldClock
 ) -> list[LiveRobot]:
     """Start all robots; their cameras are not synchronized."""
-    floor, robots = paint_background(), []
+    floor, robots = paint_floor(0), []
     for k, (name, controller) in enumerate(controllers().items()):
         source = RobotSource(world, RobotCamera(world, name, floor), clock, k / (len(world.names) * FPS))
         drive = RobotDrive(world, name, controller, clock)

@@ -35,6 +35,7 @@ from fusion.recordings.offline_fusion import (
     fuse_recording,
     read_detections,
 )
+from fusion.recordings.recording_files import say_skipped
 
 HOLDS, DIFFERS = 0, 1  # exit codes; 2 for mistakes, and where the object was not seen
 MAX_SECONDS = 600.0
@@ -98,8 +99,7 @@ class Verify:
         for message in track(markers, "fusing"):
             verifier.add(message)
         if not self.json:
-            for reason, count in sorted(summary.faults.items()):
-                say(f"skipped: {count} {reason}")
+            say_skipped(summary.faults)
         return cameras, verifier.report()
 
     def _read_recording(self, summary: Summary) -> tuple[dict[str, Camera], Iterator[Markers]]:

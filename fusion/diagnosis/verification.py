@@ -24,7 +24,7 @@ from calib.rig.precision_map import SIGMA_PX, FloorGrid, error_rows
 from calib.rig.triangulation import JointCovariance, point_derivatives
 from calib.rig.wand_file import WandBody
 from camera_node.foundation.arrays import Array, Index
-from camera_node.geometry.pose import rotation_from_vector, skew
+from camera_node.geometry.pose import rigid_motions, rotation_from_vector, skew
 from fusion.diagnosis.known_object import ObjectFinder, Sighting
 from fusion.errors import FusionError
 from fusion.model.likeness import distances
@@ -314,10 +314,8 @@ def fit_rigidly(position: Array, covariance: Array, points: Array) -> tuple[floa
         the sum of squared residuals in standard deviations, and its degrees of freedom.
     """
     whiten: Array = np.linalg.inv(np.linalg.cholesky(covariance)).astype(float)
-    centre, origin = position.mean(axis=0), points.mean(axis=0)
-    U, _, Vt = np.linalg.svd((position - centre).T @ (points - origin))
-    R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    t, rank = centre - R @ origin, 0
+    T, rank = rigid_motions(points, position), 0
+    R, t = T[:3, :3], T[:3, 3]
     for _ in range(ITERATIONS):
         residual, J = _whitened(whiten, position, points, R, t)
         step, _, rank, _ = np.linalg.lstsq(J, residual, rcond=RANK)

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from camera_node.detection.detector import Detector
 from camera_node.detection.relative_positions import DiscLocalizer
 from camera_node.protocol.messages import RelativePositions, decode, encode
+from camera_node.simulation.floor import paint_floor
 from formation.formation_control import Controller
-from formation.formation_robots import CAMERA, FPS, ROUNDEL, RobotCamera, RobotWorld, paint_background
+from formation.formation_robots import CAMERA, FPS, ROUNDEL, RobotCamera, RobotWorld
 from formation.live_formation import FormationScore, controllers, start_world
 
 
@@ -42,7 +43,7 @@ class RobotProgram:
 
 def run_lockstep(seconds: float, seed: int = 0) -> Iterator[tuple[float, FormationScore]]:
     """Yield time and score after each frame, for simulated `seconds`."""
-    world, score, floor = start_world(seed), FormationScore(), paint_background(seed)
+    world, score, floor = start_world(seed), FormationScore(), paint_floor(seed)
     programs = [
         RobotProgram(name, RobotCamera(world, name, floor), controller)
         for name, controller in controllers().items()

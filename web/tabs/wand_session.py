@@ -16,6 +16,7 @@ from calib.live.trials import WandSession
 from calib.live.wand_position import locate_wand
 from calib.rig.recording import save_wand_recording, wand_recording_path
 from calib.rig.rig import Rig, load_rig, save_rig
+from calib.rig.rig_messages import moved_mm
 from calib.wand.nominal_lens import load_known_lenses, with_nominal_lenses
 from camera_node.foundation.arrays import Array
 from camera_node.foundation.config import load_yaml
@@ -196,8 +197,7 @@ def describe_move(before: Rig, after: Rig, name: str) -> str:
     new, old = after.cameras[name], before.cameras.get(name)
     if old is None or old.T_world_cam is None:
         return f"{name} is placed"
-    moved_mm = 1e3 * float(np.linalg.norm(new.matrix()[:3, 3] - old.matrix()[:3, 3]))
-    return f"{name} moved by {moved_mm:.1f} mm"
+    return f"{name} moved by {moved_mm(old, new):.1f} mm"
 
 
 def describe_calibration(calibration: dict[str, Any]) -> str:
