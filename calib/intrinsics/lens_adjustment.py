@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_cost, cauchy_weights, coordinate_sigma
+from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_cost, cauchy_weights, coordinate_sigma, rms
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import motion_from, rotation_from_vector
@@ -91,12 +91,12 @@ class AdjustedLens:
     @property
     def view_rms_px(self) -> Array:
         """(V,) root mean square reprojection error of each view."""
-        return np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in self.residuals])
+        return np.array([rms(np.linalg.norm(r, axis=1)) for r in self.residuals])
 
     @property
     def rms_px(self) -> float:
         """Root mean square reprojection error of all views."""
-        return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in self.residuals]))))
+        return rms(np.linalg.norm(np.concatenate(self.residuals), axis=1))
 
 
 def adjust_lens(

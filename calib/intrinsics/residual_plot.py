@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig.coverage import CELLS
+from calib.rig.estimation import rms
 from calib.rig.precision_map import PAPER
 from camera_node.detection.overlay import SHIFT
 from camera_node.foundation.arrays import Array, Mask
@@ -46,8 +47,7 @@ def draw_residuals(
         _draw_arrow(canvas, start, gain * r, _green_to_red(length / (2 * typical)), 1)
     for start, r in _cell_means(starts, residuals, canvas.shape[0]):
         _draw_arrow(canvas, start, gain * r, MEAN, 3)
-    rms = float(np.sqrt((lengths**2).mean())) if len(lengths) else float("nan")
-    title = f"{name}: RMS {rms:.3f} px, {len(observed)} points, arrows x {gain:.0f}; thick: mean of a cell"
+    title = f"{name}: RMS {rms(lengths):.3f} px, {len(observed)} points, arrows x {gain:.0f}; thick: mean of a cell"
     title += "; shaded: wand not seen" if missing is not None else ""
     cv2.putText(canvas, title, (8, TITLE - 12), cv2.FONT_HERSHEY_SIMPLEX, 0.5, INK, 1, cv2.LINE_AA)
     return canvas

@@ -6,6 +6,7 @@ distribution, whose median is (2 log 2)^1/2 standard deviations of one coordinat
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from camera_node.foundation.arrays import Array
 
@@ -22,6 +23,12 @@ STEPS = 10  # of Gauss-Newton at the most: from a start nearby, each doubles the
 def coordinate_sigma(distances: Array) -> float:
     """Robust standard deviation of one coordinate, from distances (n,) in the image."""
     return float(np.median(distances)) / float(np.sqrt(2 * np.log(2)))
+
+
+def rms(values: ArrayLike) -> float:
+    """Root mean square of values (n,); NaN of none."""
+    values = np.asarray(values, float)
+    return float(np.sqrt((values**2).mean())) if len(values) else float("nan")
 
 
 def cauchy_cost(squares: Array, scale: float) -> float:

@@ -21,13 +21,7 @@ from calib.wand.alignment import Alignment, align_clocks
 from calib.wand.bundle_adjustment.covariance import estimate_lens_priors
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.optimizer import adjust, optimize, optimize_robustly
-from calib.wand.bundle_adjustment.problem import (
-    SLEWED_DRIFT,
-    Adjusted,
-    Estimate,
-    State,
-    WandObservations,
-)
+from calib.wand.bundle_adjustment.problem import SLEWED_DRIFT, Adjusted, Estimate, State, WandObservations
 from calib.wand.bundle_adjustment.problem_setup import add_background, build_problem
 from calib.wand.clock_model import ClockModel, choose_clocks, clock_candidates, find_jump, with_readout_times
 from calib.wand.conclusion import Placement, Solution, conclude, with_aligned_clocks
@@ -488,7 +482,7 @@ def _prepare_fine(
     recording: WandRecording, rough: RoughRig, coarse: Adjusted, clocks: ClockModel
 ) -> Estimate:
     """The problem of the fine stage, from the coarse stage's cameras, lenses and clocks."""
-    lenses = [coarse.state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
+    lenses = coarse.state.corrected(recording.lenses)
     better = replace(rough, cameras=coarse.state.cameras, offset_s=clocks.clocks[:, 0])
     start = _build(recording.undistort_tracks(lenses), better, FINE_SETS)
     state = replace(start.state, clocks=clocks.clocks, lenses=coarse.state.lenses, shape=coarse.state.shape)

@@ -9,15 +9,11 @@ import numpy as np
 
 from calib.rig.camera import DRIFT, LENS, OFFSET, POSE, READOUT, Camera, transform
 from calib.rig.camera_errors import ERRORS, as_pose_errors, with_errors
+from calib.rig.estimation import rms
 from calib.rig.rig import Rig
 from calib.wand.alignment import Alignment, ClockMap
 from calib.wand.bundle_adjustment.covariance import CameraCovariance, camera_covariance, parameter_sigma
-from calib.wand.bundle_adjustment.problem import (
-    Adjusted,
-    WandObservations,
-    gauge_directions,
-    scale_direction,
-)
+from calib.wand.bundle_adjustment.problem import Adjusted, WandObservations, gauge_directions, scale_direction
 from calib.wand.bundle_adjustment.residuals import point_residuals
 from calib.wand.detections import WandRecording
 from calib.wand.quality.checks import measure_lengths
@@ -236,8 +232,8 @@ def _report_background(adjusted: Adjusted) -> BackgroundReport | None:
     if not len(used):
         return None
     errors = point_residuals(problem, adjusted.state)[used]
-    rms = float(np.sqrt((errors**2).sum(axis=1).mean())) if used.any() else float("nan")
-    return BackgroundReport(len(problem.background), len(used), float(1 - used.mean()), rms)
+    residual_px = rms(np.linalg.norm(errors, axis=1))
+    return BackgroundReport(len(problem.background), len(used), float(1 - used.mean()), residual_px)
 
 
 def _report_camera(
@@ -245,14 +241,13 @@ def _report_camera(
 ) -> CameraReport:
     mine = observations.camera == k
     used = mine & adjusted.used
-    rms = float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())) if used.any() else float("nan")
     return CameraReport(
         name=recording.names[k],
         frames=len(np.unique(recording.detections.frame[recording.detections.camera == k])),
         frames_used=len(np.unique(observations.t_s[used])),
         observations=int(used.sum()),
         outliers=int((mine & ~adjusted.used).sum()),
-        residual_px=rms,
+        residual_px=rms(np.linalg.norm(adjusted.residuals[used], axis=1)),
         sigma_mm=float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
         left_out=dict(recording.left_out[k]),
     )

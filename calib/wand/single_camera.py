@@ -9,11 +9,9 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import LENS, OFFSET, POSE
+from calib.rig.estimation import rms
 from calib.rig.rig import Rig
-from calib.wand.bundle_adjustment.covariance import (
-    camera_covariance,
-    estimate_lens_priors,
-)
+from calib.wand.bundle_adjustment.covariance import camera_covariance, estimate_lens_priors
 from calib.wand.bundle_adjustment.disc_centres import with_disc_centres
 from calib.wand.bundle_adjustment.optimizer import adjust, optimize_robustly
 from calib.wand.bundle_adjustment.problem import Adjusted, Estimate, WandObservations
@@ -28,7 +26,7 @@ from calib.wand.quality.checks import check_lenses
 from calib.wand.recording_checks import check_recording
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.body import Body
-from camera_node.geometry.pose import invert, vector_from_rotation
+from camera_node.geometry.pose import invert, rotation_angle
 from camera_node.protocol.messages import Detections
 
 MAX_FRAME_SETS = 300
@@ -151,13 +149,12 @@ def _conclude(rig: Rig, name: str, this: int, solution: Solution) -> Recalibrati
     camera = adjusted_camera(before, adjusted, covariance, this, offset_ms)
     used = adjusted.used & (observations.camera == this)
     change = None if before.T_world_cam is None else invert(before.matrix()) @ T
-    turn = None if change is None else vector_from_rotation(change[:3, :3])
     return Recalibration(
         rig=msgspec.structs.replace(rig, cameras={**rig.cameras, name: camera}),
         name=name,
         moved_mm=None if change is None else float(np.linalg.norm(change[:3, 3])) * 1e3,
-        turned_deg=None if turn is None else float(np.degrees(np.linalg.norm(turn))),
-        residual_px=float(np.sqrt((adjusted.residuals[used] ** 2).sum(axis=1).mean())),
+        turned_deg=None if change is None else float(np.degrees(rotation_angle(change[:3, :3]))),
+        residual_px=rms(np.linalg.norm(adjusted.residuals[used], axis=1)),
         sigma_mm=float(np.sqrt(np.trace(cov[3:, 3:]) / 3)) * 1e3,
         time_sigma_ms=1e3 * float(np.sqrt(covariance.of(OFFSET)[this, 0, this, 0])),
         adjusted=adjusted,

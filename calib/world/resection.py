@@ -16,11 +16,11 @@ import numpy as np
 
 from calib.errors import CalibrationError
 from calib.rig.camera import MIN_MARKERS, Camera, pixel_jacobians, solve_view, span_dimension, transform
-from calib.rig.estimation import MARGIN, STEPS
+from calib.rig.estimation import MARGIN, STEPS, rms
 from calib.world.landmarks import FIT_PX
 from calib.world.still_roundels import StillRoundel
 from camera_node.foundation.arrays import Array, Index
-from camera_node.geometry.pose import Pose, invert, motion_from, rotation_from_vector, vector_from_rotation
+from camera_node.geometry.pose import Pose, invert, motion_from, rotation_angle, rotation_from_vector
 
 SIGMA_PX = 0.2  # of a mean centre: the centre of the ellipse is not exactly that of the disc
 MAX_ASSIGNMENTS = 20_000  # of three roundels to three points: a few seconds
@@ -73,9 +73,9 @@ def place_by_points(
     fit = _fit_uniquely(name, camera, pixels[rows[seen]], places[seen], sigma_m)
     misses = fit.misses_m()
     extent = float(np.linalg.norm(np.ptp(places[seen], axis=0)))
-    if np.sqrt((misses**2).mean()) > MAX_MISS * extent:
+    if rms(misses) > MAX_MISS * extent:
         raise CalibrationError(
-            f"camera '{name}': the points are {1e3 * np.sqrt((misses**2).mean()):.0f} mm from its rays; check their "
+            f"camera '{name}': the points are {1e3 * rms(misses):.0f} mm from its rays; check their "
             "names, units (metres) and axes (z up), and the lens"
         )
     placed = msgspec.structs.replace(
@@ -98,11 +98,11 @@ def _assign(name: str, camera: Camera, pixels: Array, places: Array) -> Index:
             f"camera '{name}' sees {len(pixels)} stationary roundels, which is too many to try; mask the others, or "
             "number the roundels in the observations"
         )
-    rays = np.column_stack([camera.normalise(pixels), np.ones(len(pixels))])
+    xy = camera.normalise(pixels)
     found: dict[tuple[int, ...], float] = {}
     for rows in chosen:
         for roundels in permutations(range(len(pixels)), 3):
-            for T_cam_world in _three_point_poses(rays[list(roundels)], places[list(rows)]):
+            for T_cam_world in _three_point_poses(xy[list(roundels)], places[list(rows)]):
                 assignment, distance_px = _match(camera, T_cam_world, pixels, places)
                 found[assignment] = min(found.get(assignment, np.inf), distance_px)
     ranked = sorted(found, key=lambda rows: (sum(k >= 0 for k in rows), -found[rows]), reverse=True)
@@ -121,13 +121,11 @@ def _assign(name: str, camera: Camera, pixels: Array, places: Array) -> Index:
     return np.array(best, np.intp)
 
 
-def _three_point_poses(rays: Array, places: Array) -> Iterator[Array]:
-    """T_cam_world (4, 4) under which three points (3, 3) are on three rays (3, 3) of depth 1."""
-    count, turns, shifts = cv2.solveP3P(
-        places[:, None], rays[:, None, :2], np.eye(3), np.empty(0), flags=cv2.SOLVEPNP_AP3P
-    )
-    for k in range(count):
-        T = motion_from(turns[k], shifts[k])
+def _three_point_poses(xy: Array, places: Array) -> Iterator[Array]:
+    """T_cam_world (4, 4) under which three points (3, 3) have image plane coordinates (3, 2)."""
+    _, turns, shifts = cv2.solveP3P(places, xy, np.eye(3), None, flags=cv2.SOLVEPNP_AP3P)
+    for turn, shift in zip(turns, shifts, strict=True):
+        T = motion_from(turn, shift)
         if np.isfinite(T).all():
             yield T
 
@@ -186,9 +184,8 @@ class _Fit:
 
     def misses_m(self) -> Array:
         """(N,) distances of the points from the rays of their roundels."""
-        rays = np.column_stack([self.camera.normalise(self.pixels), np.ones(len(self.pixels))])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        return np.linalg.norm(np.cross(rays, transform(invert(self.T), self.places)), axis=1)
+        local = transform(invert(self.T), self.places)
+        return np.linalg.norm(np.cross(self.camera.rays(self.pixels), local), axis=1)
 
 
 def _fit_uniquely(name: str, camera: Camera, pixels: Array, places: Array, sigma_m: float) -> _Fit:
@@ -202,7 +199,7 @@ def _fit_uniquely(name: str, camera: Camera, pixels: Array, places: Array, sigma
         raise CalibrationError(f"camera '{name}': no pose fits the points; check their names and the lens")
     best = fits[0]
     for other in fits[1:]:
-        turn = _angle(best.T, other.T)
+        turn = rotation_angle(best.T[:3, :3].T @ other.T[:3, :3])
         if turn > 1e-3 and other.chi2() < best.chi2() + MARGIN:
             raise CalibrationError(
                 f"camera '{name}': two poses fit the points, {np.degrees(turn):.0f} degrees apart; spread the points, "
@@ -221,8 +218,3 @@ def _fit_from_all_starts(camera: Camera, pixels: Array, places: Array, sigma_m: 
             fit = fit.moved()
         if np.isfinite(fit.chi2()):
             yield fit
-
-
-def _angle(a: Array, b: Array) -> float:
-    """Angle between two rotations, radians."""
-    return float(np.linalg.norm(vector_from_rotation(a[:3, :3].T @ b[:3, :3])))

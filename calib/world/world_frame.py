@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from calib.errors import CalibrationError
 from calib.rig.camera import span_dimension, transform
+from calib.rig.estimation import rms
 from calib.rig.rig import Rig
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose, rigid_motions
@@ -124,10 +125,9 @@ def align_positions(
         rig = msgspec.structs.replace(rig, calibration={**rig.calibration, "metric": True})
     T = rigid_motions(a, b)
     distances = np.linalg.norm(transform(T, a) - b, axis=1)
-    rms = np.sqrt((distances**2).mean())
-    if rms > MAX_MISFIT * _extent(b):
+    if (misfit := rms(distances)) > MAX_MISFIT * _extent(b):
         raise CalibrationError(
-            f"the surveyed positions do not match: the RMS distance is {rms:.3f} m, and the survey is {scale:.3f} "
+            f"the surveyed positions do not match: the RMS distance is {misfit:.3f} m, and the survey is {scale:.3f} "
             "times as large as the rig; check names, units (metres) and the wand's lengths"
         )
     return move_rig(rig, T), dict(zip(names, distances.tolist(), strict=True))

@@ -76,6 +76,11 @@ def vector_from_rotation(R: ArrayLike) -> Array:
     return q[..., 1:] * (2 * np.arctan2(sine, q[..., :1]) / np.maximum(sine, 1e-12))
 
 
+def rotation_angle(R: ArrayLike) -> float:
+    """The angle of a rotation (3, 3), in [0, pi] radians."""
+    return float(np.linalg.norm(vector_from_rotation(R)))
+
+
 def rotation_with_z(z: ArrayLike) -> Array:
     """(..., 3, 3) rotations whose third columns are the unit vectors `z` (..., 3), and the first ones as near as
     possible to (1, 0, 0); arbitrary for `z` parallel to that."""

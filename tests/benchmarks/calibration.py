@@ -14,6 +14,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
+from calib.rig.estimation import rms
+
 # Before NumPy is loaded, as in the programs that calibrate.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -23,21 +25,13 @@ from rich.table import Table
 
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
-from calib.wand.wand_report import WandCalibration
 from camera_node.geometry.body import Body
 from tests.benchmarks.calibration_acceptance import run as run_acceptance
 from tests.benchmarks.calibration_data import run as run_data
 from tests.benchmarks.calibration_honesty import run as run_honesty
-from tests.benchmarks.calibration_recordings import (
-    DATA,
-    SQUARE_M,
-    board_corners,
-    corner_errors,
-    recording,
-    rms,
-)
+from tests.benchmarks.calibration_recordings import DATA, SQUARE_M, board_corners, corner_errors, recording
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
-from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, joint_error, roughly
+from tests.calib.synthetic import CAREFUL, OLD, SHEET, camera_errors, clock_errors_ms, joint_error, roughly
 
 SEEDS = 3  # recordings of each simulated row
 Row = tuple[str, str, str]
@@ -94,7 +88,7 @@ def _run(
         len(result.rig.placed()),
         rms(shift),
         rms(turn),
-        offset_error(result, recorded),
+        rms(clock_errors_ms(result, recorded.truth)),
         squared,
         degrees,
         cost,
@@ -103,15 +97,6 @@ def _run(
 
 def _chi_square(degrees: int) -> str:
     return f"{degrees} +- {np.sqrt(2 * degrees):.0f}"
-
-
-def offset_error(result: WandCalibration, recorded: SimulatedRecording) -> float:
-    """RMS error of the time offsets, ms."""
-    cameras = result.rig.placed()
-    error = np.array(
-        [c.time_offset_ms - recorded.truth.cameras[n].time_offset_ms for n, c in cameras.items()]
-    )
-    return rms(error - error.mean())
 
 
 def waved_led() -> tuple[list[Row], float]:

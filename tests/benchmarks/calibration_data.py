@@ -28,6 +28,7 @@ from scipy.sparse import coo_array
 
 from calib.errors import CalibrationError
 from calib.rig.camera import Camera, with_distortion
+from calib.rig.estimation import rms
 from calib.rig.rig import Rig
 from calib.rig.triangulation import triangulate_points
 from calib.wand.calibrate import calibrate
@@ -44,7 +45,6 @@ from tests.benchmarks.calibration_recordings import (
     corner_errors,
     pixels_at,
     recording,
-    rms,
     sorted_track,
     tracks_of_messages,
 )

@@ -100,8 +100,3 @@ def corner_errors(rig: Rig, messages: Sequence[Detections], step_s: float = 0.17
             for a, b in combinations(np.flatnonzero(np.isfinite(found[:, 0])), 2)
         ]
     return np.array(errors)
-
-
-def rms(values: Array) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -24,6 +24,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
+from calib.rig.estimation import rms
 from calib.rig.recording import read_messages
 from calib.rig.rig import Rig, load_rig
 from camera_node.foundation.terminal import console, say
@@ -32,13 +33,7 @@ from camera_node.sources.recorded_detections import read_observations
 from fusion.recordings.arena_recording import POSE, read_recording
 from roundel import Detector, track
 from tests.benchmarks.calibration_data import gather_points, residuals_px
-from tests.benchmarks.calibration_recordings import (
-    DATA,
-    board_corners,
-    corner_errors,
-    rms,
-    tracks_of_messages,
-)
+from tests.benchmarks.calibration_recordings import DATA, board_corners, corner_errors, tracks_of_messages
 from tests.web.roundel.programs import roundel_command
 
 NEXT = re.compile(r"^next: roundel (.*)$", re.MULTILINE)

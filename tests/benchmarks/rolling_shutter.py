@@ -17,6 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from calib.rig.estimation import rms
 from calib.wand.calibrate import calibrate
 from calib.wand.wand_report import WandCalibration
 from camera_node.foundation.arrays import Array
@@ -27,9 +28,8 @@ from fusion.model.states import States
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
 from tests.benchmarks.calibration_honesty import clock_error
-from tests.benchmarks.calibration_recordings import rms
 from tests.calib.recordings import SimulatedRecording, WandScenario, record
-from tests.calib.synthetic import joint_error
+from tests.calib.synthetic import clock_errors_ms, joint_error
 from tests.fusion.rendered_arena import RenderedArena
 from tests.fusion.synthetic import PERIOD_NS, SINGLE, TRIANGLE, WIDE, Arena, drive
 
@@ -160,9 +160,7 @@ def calibration_table(readout_ms: float, seeds: int) -> Table:
         readouts, offsets, normalized = [], [], []
         for seed in range(seeds):
             result, recorded = calibrate_wand(readout, seed)
-            truth = np.array([recorded.truth.cameras[n].time_offset_ms for n in result.names])
-            off = result.time_offset_ms - truth
-            offsets.append(off - off.mean())
+            offsets.append(clock_errors_ms(result, recorded.truth))
             squared, degrees = joint_error(result, recorded.truth)
             normalized.append((clock_error(result, recorded.truth), squared / degrees))
             if result.readout_sigma_ms.any():

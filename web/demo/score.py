@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import psutil
 
+from calib.rig.estimation import rms
 from camera_node.foundation.arrays import Array
-from camera_node.geometry.pose import rotation_from_wxyz
+from camera_node.geometry.pose import rotation_angle, rotation_from_wxyz
 from fusion.protocol.pose_messages import RobotPose
 from web.state.feed import Feed
 
@@ -91,7 +92,7 @@ class PoseScore:
         position, R = np.array(pose.position), rotation_from_wxyz(pose.quaternion_wxyz)
         errors.t_ns.append(pose.t_ns)
         errors.position_mm.append(1e3 * float(np.linalg.norm(position - T_true[:3, 3])))
-        errors.rotation_deg.append(angle_deg(R, T_true[:3, :3]))
+        errors.rotation_deg.append(float(np.degrees(rotation_angle(R.T @ T_true[:3, :3]))))
         errors.normalized.append(_normalized(position - T_true[:3, 3], pose))
 
     def all_tracked(self) -> bool:
@@ -130,17 +131,6 @@ def longest_gap_s(t_ns: list[int], start_ns: int, end_ns: int) -> float:
     """Return the longest interval between `start_ns` and `end_ns` without any of the times, seconds."""
     inside = [t for t in sorted(t_ns) if start_ns < t < end_ns]
     return float(np.diff([start_ns, *inside, end_ns]).max()) * 1e-9
-
-
-def angle_deg(A: Array, B: Array) -> float:
-    """Return the angle between two rotations (3, 3), degrees."""
-    half_chord = np.linalg.norm(A - B) / np.sqrt(8.0)  # |A - B|_F = 2 sqrt(2) sin(angle / 2)
-    return float(np.degrees(2 * np.arcsin(min(1.0, half_chord))))
-
-
-def rms(values: list[float]) -> float:
-    """Return the root mean square; NaN for no values."""
-    return float(np.sqrt(np.mean(np.square(values)))) if values else float("nan")
 
 
 def summarize(results: list[RobotScore], latencies_ms: list[float]) -> list[str]:

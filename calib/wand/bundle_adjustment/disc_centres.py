@@ -31,7 +31,7 @@ def with_disc_centres(
 ) -> WandObservations:
     """The observations of ellipse centres, corrected to the markers of the wand at a state."""
     points = predict_markers(problem, observations, state).points
-    lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
+    lenses = state.corrected(problem.lenses)
     offsets = centre_offsets(lenses, state.cameras, observations, points, wand)
     return replace(observations, uv=observations.uv - offsets)
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The data of the wand's bundle adjustment: observations, unknowns (`State`) and constants (`Problem`)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -216,6 +217,10 @@ class State:
         higher = parameters[5:9]  # a fisheye has three
         higher += change[5 : 5 + len(higher)]
         return lens.with_parameters(parameters)
+
+    def corrected(self, lenses: Sequence[Lens]) -> list[Lens]:
+        """The given lenses of all cameras with this state's corrections."""
+        return [self.lens(k, lens) for k, lens in enumerate(lenses)]
 
 
 @dataclass(frozen=True, slots=True)

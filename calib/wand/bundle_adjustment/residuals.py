@@ -94,7 +94,7 @@ def find_weights(problem: Problem, observations: WandObservations, state: State)
     """
     motion = predict_markers(problem, observations, state)
     spread = problem.density * motion.location.spread
-    lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
+    lenses = state.corrected(problem.lenses)
     J = _known(point_jacobians(lenses, state.cameras, observations.camera, motion.points)[1])
     along = observations.stamp_sigma_s[:, None] * motion.velocity(problem.knot_s)
     by_stamp = J @ along[:, :, None]

@@ -21,7 +21,7 @@ from scipy.special import chdtrc
 
 from calib.errors import CalibrationError, CameraFault
 from calib.rig.camera import LENS, lens_parameters
-from calib.rig.estimation import CHANCE, CLEAR, GROSS, coordinate_sigma
+from calib.rig.estimation import CHANCE, CLEAR, GROSS, coordinate_sigma, rms
 from calib.rig.triangulation import intersect_images
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.bundle_adjustment.problem import Adjusted, State, WandObservations
@@ -44,7 +44,7 @@ MIN_CAMERAS = 3  # that saw a marker at once: the rays of two meet for many exch
 def check_lenses(names: Sequence[str], adjusted: Adjusted) -> None:
     """Raise CameraFault where the lenses of two cameras are swapped."""
     lenses, cov = adjusted.problem.lenses, camera_covariance(adjusted).of(LENS)
-    found = [adjusted.state.lens(k, lens) for k, lens in enumerate(lenses)]
+    found = adjusted.state.corrected(lenses)
     for a, b in combinations(adjusted.problem.estimated_cameras(), 2):
         crossed = (
             _lens_distance(found[a], lenses[b], cov[a, :, a]),
@@ -97,7 +97,7 @@ def check_sizes(wand: Body, adjusted: Adjusted, observations: WandObservations) 
     state, problem = adjusted.state, adjusted.problem
     if len(problem.wand.lengths) == 0:
         return
-    lenses = [state.lens(k, lens) for k, lens in enumerate(problem.lenses)]
+    lenses = state.corrected(problem.lenses)
     points = predict_markers(problem, observations, state).points
     by_lengths = np.linalg.norm(points - state.cameras[observations.camera, :3, 3], axis=1)
     ratio = ranges(lenses, observations, wand.diameter_m) / by_lengths
@@ -119,7 +119,7 @@ def triangulate_markers(adjusted: Adjusted, observations: WandObservations) -> A
     state, problem, rows = adjusted.state, adjusted.problem, np.flatnonzero(adjusted.used)
     markers = np.einsum("mb,kbx->kmx", problem.wand.displaced(state.shape).weights, state.motion[:, 0])
     camera, k, m = observations.camera[rows], observations.knot[rows], observations.label[rows]
-    lenses = [state.lens(c, lens) for c, lens in enumerate(problem.lenses)]
+    lenses = state.corrected(problem.lenses)
     J = np.nan_to_num(point_jacobians(lenses, state.cameras, camera, markers[k, m])[1])
     weight, residuals = np.linalg.inv(observations.cov[rows]), np.nan_to_num(adjusted.residuals[rows])
     A, b = np.zeros((*markers.shape, 3)), np.zeros(markers.shape)
@@ -172,10 +172,10 @@ class TriangulatedResiduals:
         fine = norms <= GROSS * coordinate_sigma(norms)
         return Validation(
             count=len(norms),
-            all_px=_rms(norms),
+            all_px=rms(norms),
             gross=float((~fine).mean()),
-            residual_px=_rms(norms[fine]),
-            error_m=_rms((norms / self.focal_px[known] * distance)[fine]),
+            residual_px=rms(norms[fine]),
+            error_m=rms((norms / self.focal_px[known] * distance)[fine]),
             range_m=float(np.median(distance)),
         )
 
@@ -188,10 +188,9 @@ def triangulated_residuals(recording: WandRecording, state: State) -> Triangulat
         recording: labeled detections of C cameras.
         state: poses, clocks and lenses of these cameras.
     """
-    lenses = [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
-    timed = recording.timed()
-    count = len(timed)
+    lenses, timed = state.corrected(recording.lenses), recording.timed()
     recording = recording.select(timed).with_row_times(state.clocks[:, 2]).undistort_tracks(lenses)
+    count = len(timed)
     points, pixels = np.full((count, 3), np.nan), np.full((count, 2), np.nan)
     range_m, focal_px = np.full(count, np.nan), np.empty(count)
     for camera, lens in enumerate(lenses):
@@ -216,10 +215,6 @@ def _triangulate_rows(recording: WandRecording, state: State, lens: Lens, camera
         xy[other] = interpolate(tracks, detections.label, stamp_s, recording.timing.gap_s)
     xy[camera] = lens.normalise(detections.uv)
     return intersect_images(xy[:, None], state.cameras)[0][0]
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 def find_exchanges(
@@ -263,7 +258,7 @@ def _compare_with_motion(
     inliers = predict_markers(adjusted.problem, observations.select(adjusted.used), state)
     speed = float(np.median(np.linalg.norm(inliers.velocity(adjusted.problem.knot_s), axis=1)))
     off, gate = np.empty((2, len(rejected), len(recording.names)))
-    for camera, lens in enumerate(_adjusted_lenses(recording, state)):
+    for camera, lens in enumerate(state.corrected(recording.lenses)):
         T = state.cameras[camera]
         off[:, camera] = _pixel_distances(lens, T, points, rejected.uv)
         moved_m = speed * recording.timing.period_s / np.linalg.norm(points - T[:3, 3], axis=1)
@@ -341,7 +336,7 @@ def _tabulate(recording: WandRecording) -> Index:
 def _misfit(recording: WandRecording, state: State, table: Index, order: Index) -> Array:
     """(K,) largest distance of the detections of each row of a table (K, C) from the point where their rays meet, if
     camera k shows the detections of camera order[k]; relative to the images' longer sides."""
-    cameras, lenses = len(order), _adjusted_lenses(recording, state)
+    cameras, lenses = len(order), state.corrected(recording.lenses)
     uv = recording.detections.uv
     pixels, xy = np.full((2, cameras, len(table), 2), np.nan)
     for shown in range(cameras):
@@ -355,7 +350,3 @@ def _misfit(recording: WandRecording, state: State, table: Index, order: Index) 
         off = _pixel_distances(lens, state.cameras[camera], points[seen], pixels[camera, seen])
         misfit[seen] = np.maximum(misfit[seen], off / max(lens.width, lens.height))
     return misfit
-
-
-def _adjusted_lenses(recording: WandRecording, state: State) -> list[Lens]:
-    return [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]

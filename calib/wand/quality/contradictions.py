@@ -26,7 +26,7 @@ from calib.wand.quality.checks import (
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.body import Body
 from camera_node.geometry.lens import Lens
-from camera_node.geometry.pose import invert, motion_from, vector_from_rotation
+from camera_node.geometry.pose import invert, motion_from, rotation_angle
 
 HALF = 0.5  # of a camera's contradicting detections, by which a motion must explain more of all
 MIRRORS = {"left to right": (True, False), "top to bottom": (False, True), "": (True, True)}
@@ -104,7 +104,7 @@ def check_residuals(recording: WandRecording, adjusted: Adjusted) -> Triangulate
     """
     state = adjusted.state
     residuals = triangulated_residuals(recording, state)
-    lenses = [state.lens(k, lens) for k, lens in enumerate(recording.lenses)]
+    lenses = state.corrected(recording.lenses)
     off = np.linalg.norm(residuals.pixels, axis=1)
     known = np.isfinite(off)
     if not known.any():
@@ -158,7 +158,7 @@ def _explain_motion(
         return 0, ""
     there = invert(motion_from(turn, shift))
     apart = np.linalg.norm(there[:3, 3] - camera[:3, 3])
-    turned = np.degrees(np.linalg.norm(vector_from_rotation(there[:3, :3] @ camera[:3, :3].T)))
+    turned = np.degrees(rotation_angle(there[:3, :3] @ camera[:3, :3].T))
     t_s, fitting = recording.detections.t_s, rows[np.asarray(inliers, np.intp).ravel()]
     at_s, gain = _find_motion(t_s[known & ~gross], t_s[fitting])
     if gain < max(MIN_COUNT, HALF * len(rows)):

@@ -12,6 +12,7 @@ from camera_node.geometry.pose import (
     adjoint,
     invert,
     look_at,
+    rotation_angle,
     rotation_from_vector,
     rotation_from_wxyz,
     skew,
@@ -62,6 +63,11 @@ def test_stacks_of_rotations_equal_single_ones_and_keep_their_vectors(vectors: l
         np.testing.assert_array_equal(rotation, rotation_from_vector(vector))
         np.testing.assert_array_equal(wxyz, wxyz_from_rotation(rotation))
     np.testing.assert_allclose(vector_from_rotation(R), stack, atol=1e3 * EPS)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.5, np.pi])
+def test_the_angle_of_a_rotation(angle: float):
+    assert rotation_angle(rotation_from_vector([0.0, angle, 0.0])) == pytest.approx(angle, abs=1e-9)
 
 
 def test_a_vector_is_a_rotation_about_its_axis():

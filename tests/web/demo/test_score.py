@@ -6,7 +6,7 @@ import pytest
 
 from camera_node.geometry.pose import rotation_from_vector, wxyz_from_rotation
 from fusion.protocol.pose_messages import RobotPose, TrackingState
-from web.demo.score import PoseScore, angle_deg, describe_overload, longest_gap_s, summarize
+from web.demo.score import PoseScore, describe_overload, longest_gap_s, summarize
 
 SECOND = 10**9
 ROBOTS = {"rover": 3, "puck": 1}
@@ -110,13 +110,6 @@ def test_the_longest_gap():
     assert longest_gap_s([3 * SECOND, SECOND], 0, 4 * SECOND) == 2.0
     assert longest_gap_s([], 0, 4 * SECOND) == 4.0
     assert longest_gap_s([9 * SECOND], 0, 4 * SECOND) == 4.0
-
-
-def test_the_angle_of_a_rotation():
-    """Of known rotations up to a half turn."""
-    for angle in (0.0, 1e-6, 0.5, np.pi):
-        R = rotation_from_vector([0.0, angle, 0.0])
-        assert angle_deg(np.eye(3), R) == pytest.approx(np.degrees(angle), abs=1e-6)
 
 
 def test_the_summary_has_one_line_per_robot():
