@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 #include "search/ray_fit.hpp"
 #include "verify/level_check.hpp"
@@ -68,7 +69,7 @@ FrameResult Detector::detect(const ImageView& image) {
     // 4. Roundels that moved during the exposure.
     fit_moving_tracked(lost, frame);
     fit_moving_streaks(candidates.streaks, frame);
-    const bool learned = decide(frame);
+    const bool observed = decide(frame);
     // 5. Tracks, and what the next frame needs not search again.
     tracks_.update(frame.found);
     if (paper_)
@@ -76,7 +77,7 @@ FrameResult Detector::detect(const ImageView& image) {
     else
         mark_searched(parts, frame.found);
     // 6. What the roundels show of their prints and of the camera, and their codes.
-    if (!learned) observe(frame);
+    if (!observed) observe(frame);
     for (TrackedFit& roundel : frame.found) camera_.claim(roundel.fit);
     tracks_.read_codes(frame.found, frame.image);
     return {std::move(frame.found), n_postponed_};
@@ -96,11 +97,11 @@ std::optional<InitialGuess> Detector::guess(const Seed& seed, const FrameState& 
 std::vector<ExpectedRoundel> Detector::fit_tracked(FrameState& frame) const {
     std::vector<ExpectedRoundel> lost;
     for (const ExpectedRoundel& expected : tracks_.expect()) {
-        if (expected.steady && fit_and_accept(expected.guess(), expected.track, frame)) continue;
+        if (expected.steady && fit_and_accept(expected.guess(), expected.track, true, frame)) continue;
         Seed seed = expected.seed;
         seed.dark = int(camera_.encoded(seed.dark));
         seed.bright = int(camera_.encoded(seed.bright));
-        if (!fit_and_accept(guess(seed, frame), expected.track, frame)) lost.push_back(expected);
+        if (!fit_and_accept(guess(seed, frame), expected.track, true, frame)) lost.push_back(expected);
     }
     return lost;
 }
@@ -111,6 +112,10 @@ std::vector<Box> Detector::parts_to_search(const FrameState& frame) {
     if (n_frames_ == kSearchInterval || n_postponed_) {
         change_mask_.invalidate();
         n_frames_ = 0;
+    }
+    if (std::abs(std::log(camera_.exponent_in_use() / searched_with_)) >= kMinTone) {
+        searched_with_ = camera_.exponent_in_use();
+        change_mask_.invalidate();  // the thresholds are others
     }
     ++n_frames_;
     change_mask_.update(frame.encoded);
@@ -173,7 +178,7 @@ int Detector::fit_seeds(const std::vector<Seed>& seeds, FrameState& frame) {
     for (; done < n && frame.n_fits < most; ++done) {
         const Seed& seed = seeds[(first + done) % n];
         if (frame.suppression.contains_fast(double(seed.x), double(seed.y))) continue;
-        fit_and_accept(guess(seed, frame), -1, frame);
+        fit_and_accept(guess(seed, frame), -1, false, frame);
     }
     begin_at_ = done < n ? double((first + done) % n) / double(n) : 0;
     return int(n - done);
@@ -184,7 +189,7 @@ void Detector::fit_by_paper(FrameState& frame) {
     const ImageView view = window(frame.image, part);
     for (InitialGuess guess : paper_->find(view, tile_contrast(frame.noise, limits_), limits_)) {
         guess.outer.y += part.top;
-        fit_and_accept(guess, -1, frame);
+        fit_and_accept(guess, -1, false, frame);
     }
 }
 
@@ -202,7 +207,7 @@ void Detector::fit_moving_tracked(std::vector<ExpectedRoundel> lost, FrameState&
         };
         if (std::any_of(frame.found.begin(), frame.found.end(), is_same)) continue;
         const KnownRoundel known{expected->fit, expected->vx, expected->vy};
-        accept(fit_known_moving(frame.image, known, context(frame)), expected->track, frame);
+        accept(fit_known_moving(frame.image, known, context(frame)), expected->track, true, frame);
     }
 }
 
@@ -222,53 +227,61 @@ void Detector::fit_moving_streaks(const std::vector<Streak>& streaks, FrameState
         if (failures >= may_fail || fits == kMaxMovingFits) break;
         if (frame.suppression.contains(guess.still.outer.x, guess.still.outer.y)) continue;
         ++fits;
-        failures += !accept(fit_new_moving(frame.image, guess, context(frame)), -1, frame);
+        failures += !accept(fit_new_moving(frame.image, guess, context(frame)), -1, false, frame);
     }
 }
 
 /// Whether the camera's response is all that shapes the levels of a roundel.
 static bool shows_camera(const RoundelFit& fit) { return fit.unoccluded && !fit.fields.has_light(); }
 
-/// The model of a picture whose levels are raised to a power: codes are read by it.
-static void raise_levels(RoundelFit& fit, double exponent) {
-    const double contrast = fit.p[kBright] - fit.p[kDark];
-    for (const Parameter level : {kBright, kDark, kGround})
-        fit.p[level] = 255 * std::pow(std::max(fit.p[level], 0.0) / 255, exponent);
-    fit.noise *= (fit.p[kBright] - fit.p[kDark]) / contrast;
-}
-
-/// Decides on the roundels that a camera's tone curve and processing may explain, before both are known: all
-/// roundels of the frame show them together. Returns whether it has learned from the frame.
+/// Decides on the rings of a frame by what its roundels, and those that may be some, show together of a
+/// camera that was not known. If they show another tone curve, its roundels and the rings that were refused
+/// are fitted and tested again, too, as in the next frame. Returns whether the fits of the frame have been
+/// observed.
 bool Detector::decide(FrameState& frame) {
-    if (frame.undecided.empty()) return false;
+    if (frame.decided) return false;
     frame.decided = true;
     const auto shown = std::count_if(frame.found.begin(), frame.found.end(),
                                      [](const TrackedFit& roundel) { return shows_camera(roundel.fit); });
     const bool learns = size_t(shown) + frame.undecided.size() >= kMinWitnesses;
-    if (learns) {
-        const double before = camera_.exponent_in_use();
-        observe(frame);
-        frame.image = camera_.linearize(frame.encoded);
-        for (TrackedFit& roundel : frame.found) raise_levels(roundel.fit, camera_.exponent_in_use() / before);
-        frame.noise = noise_level(frame.image);
-        frame.density.reset();
+    const double before = camera_.exponent_in_use();
+    const bool is_other = learns && observe(frame);
+    const auto raise = [power = camera_.exponent_in_use() / before](auto& ring) {
+        for (double* level : {&ring.dark, &ring.bright}) *level = CameraModel::to_power(*level, power);
+    };
+    const auto fit_again = [&](RoundelFit fit, int track, bool known) {
+        raise(fit);
+        if (fit.motion_x != 0 || fit.motion_y != 0)
+            accept(fit_known_moving(frame.image, {fit, 0, 0}, context(frame)), track, known, frame);
+        else
+            fit_and_accept(InitialGuess{fit.outer, fit.ratio, fit.dark, fit.bright}, track, known, frame);
+    };
+    const auto undecided = std::exchange(frame.undecided, {});
+    auto refused = std::exchange(frame.refused, {});
+    if (is_other) {
+        const auto found = std::move(frame.found);
+        frame = FrameState(frame.encoded, camera_.linearize(frame.encoded), true);
+        for (const auto& [fit, track, code] : found) fit_again(fit, track, true);
     }
-    for (const RoundelFit& fit : frame.undecided)
-        fit_and_accept(
-            InitialGuess{fit.outer, fit.ratio, camera_.linear(fit.dark), camera_.linear(fit.bright)}, -1,
-            frame);
-    frame.undecided.clear();
-    return learns;
+    for (const RoundelFit& fit : undecided) fit_again(fit, -1, false);
+    if (is_other)
+        for (InitialGuess& ring : refused) {
+            raise(ring);
+            fit_and_accept(ring, -1, false, frame);
+        }
+    return learns && !is_other;
 }
 
-/// Learns what the roundels of a frame, and those that are not decided yet, show of the camera.
-void Detector::observe(const FrameState& frame) {
+/// Learns what the roundels of a frame, and those that are not decided yet, show of the camera. Returns
+/// whether another tone curve is in use.
+bool Detector::observe(const FrameState& frame) {
     std::vector<Observation> roundels;
     for (const TrackedFit& roundel : frame.found)
         if (shows_camera(roundel.fit)) roundels.push_back({&roundel.fit, roundel.track});
     for (const RoundelFit& fit : frame.undecided) roundels.push_back({&fit, -1});
-    camera_.observe(roundels, frame.image);
+    const bool is_other = camera_.observe(roundels, frame.image);
     use_camera();
+    return is_other;
 }
 
 /// Rings of other ratios than those of the camera's prints count as roundels all the same.
@@ -278,9 +291,6 @@ void Detector::use_camera() {
     if (limits_.linearized_by == camera_.exponent_in_use()) return;
     limits_.linearized_by = camera_.exponent_in_use();
     tracks_.forget_models();
-    if (std::abs(std::log(limits_.linearized_by / searched_with_)) < kMinTone) return;
-    searched_with_ = limits_.linearized_by;
-    change_mask_.invalidate();  // the next frame is searched with other thresholds
 }
 
 /// Section III-B of the paper: theta follows the mean levels of the roundels.
@@ -302,17 +312,20 @@ void Detector::mark_searched(const std::vector<Box>& parts, const std::vector<Tr
 }
 
 /// Whether there is a roundel at the guess: one found before, or one that the fit accepts and adds.
-bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const {
+bool Detector::fit_and_accept(const std::optional<InitialGuess>& guess, int track, bool known,
+                              FrameState& frame) const {
     if (!guess) return false;
     if (frame.suppression.contains(guess->outer.x, guess->outer.y)) return true;
     ++frame.n_fits;
-    return accept(fit_roundel(frame.image, *guess, context(frame), track >= 0), track, frame);
+    if (accept(fit_roundel(frame.image, *guess, context(frame), known), track, known, frame)) return true;
+    if (!frame.decided) frame.refused.push_back(*guess);
+    return false;
 }
 
-bool Detector::accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const {
+bool Detector::accept(const std::optional<RoundelFit>& fit, int track, bool known, FrameState& frame) const {
     if (!fit || frame.found.size() >= kMaxRoundels) return false;
     if (frame.suppression.contains(fit->outer.x, fit->outer.y)) return false;
-    if (track < 0) {
+    if (!known) {
         if (!frame.density) frame.density = noise_density(frame.image);
         if (refusal_of_new(frame.image, *fit, *frame.density)) return false;
     }

@@ -57,7 +57,8 @@ class Detector {
         bool decided;                     // the camera is known as well as this frame shows it
         Suppression suppression;
         std::vector<TrackedFit> found;
-        std::vector<RoundelFit> undecided;  // until the camera is known
+        std::vector<RoundelFit> undecided;  // until the camera is known,
+        std::vector<InitialGuess> refused;  // and rings that were refused until then
         int n_fits = 0;
     };
     /// Places where roundels may be, in the image's frame.
@@ -78,11 +79,12 @@ class Detector {
     void update_theta(const std::vector<TrackedFit>& found);
     void mark_searched(const std::vector<Box>& parts, const std::vector<TrackedFit>& found);
     bool decide(FrameState& frame);
-    void observe(const FrameState& frame);
+    bool observe(const FrameState& frame);
     void use_camera();
 
-    bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, FrameState& frame) const;
-    bool accept(const std::optional<RoundelFit>& fit, int track, FrameState& frame) const;
+    bool fit_and_accept(const std::optional<InitialGuess>& guess, int track, bool known,
+                        FrameState& frame) const;
+    bool accept(const std::optional<RoundelFit>& fit, int track, bool known, FrameState& frame) const;
     std::optional<InitialGuess> guess(const Seed& seed, const FrameState& frame) const;
     AcceptanceContext context(const FrameState& frame) const { return context(frame.noise, frame.decided); }
     AcceptanceContext context(double noise, bool knows_camera = true) const {

@@ -62,8 +62,7 @@ CameraPrior CameraModel::prior_at(double x, double y) const {
     return {prints_, light_.at(x, y), &remainder_, std::sqrt(curvature_.value())};
 }
 
-void CameraModel::observe(const std::vector<Observation>& roundels, const ImageView& image) {
-    if (ratios_ && ratios_->learn(roundels)) prints_ = ratios_->prints();
+bool CameraModel::observe(const std::vector<Observation>& roundels, const ImageView& image) {
     std::vector<const RoundelFit*> all, lit, whole;
     for (const auto& [fit, track] : roundels) {
         all.push_back(fit);
@@ -71,13 +70,15 @@ void CameraModel::observe(const std::vector<Observation>& roundels, const ImageV
         if (fit->unoccluded || fit->provisional) lit.push_back(fit);
     }
     if (contradicts(roundels)) forget();
+    if (ratios_ && ratios_->learn(roundels)) prints_ = ratios_->prints();
     light_.learn(lit, image);
-    learn_response(all);
+    const bool is_other = learn_response(all);
     bend_.learn(whole, std::max(1.0, correlation_.value()));
+    return is_other;
 }
 
 /// Learns tone curve and processing. Grey levels of a linear image do not compare with those of another one.
-void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
+bool CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
     learn_edge_noise(fits);
     std::vector<ToneEstimate> measured;
     std::vector<ToneSample> samples;
@@ -87,15 +88,17 @@ void CameraModel::learn_response(const std::vector<const RoundelFit*>& fits) {
             samples.push_back(estimate->sample);
         }
     learn_curvature(fits);
-    if (measured.empty()) return;
+    if (measured.empty()) return false;
     const double exponent = exponent_in_use();
+    const bool had_remainder = remainder_.any();
     const bool changed = learn_tone(std::move(measured));
     is_new_ = false;
     learn_remainder(samples);
-    if (!changed) return;
+    if (!changed) return remainder_.any() != had_remainder;
     last_.clear();
     light_.scale(exponent_in_use() / exponent);
     if (ratios_) ratios_->forget_measurements();
+    return true;
 }
 
 /// What the difference between the measured ratio and the print's says about the tone curve, beyond what the

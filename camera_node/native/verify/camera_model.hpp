@@ -31,15 +31,19 @@ class CameraModel {
     /// The image with levels in proportion to light: itself if the curve counts as linear, otherwise a copy
     /// that is valid until the next call.
     ImageView linearize(const ImageView& image);
+    static double to_power(double level, double exponent) {
+        return 255 * std::pow(std::max(level, 0.0) / 255, exponent);
+    }
     /// A level of the camera's picture in the linearized one, and the reverse.
     double linear(double level) const { return to_power(level, std::exp(log_exponent_)); }
     double encoded(double level) const { return to_power(level, std::exp(-log_exponent_)); }
 
     /// What is known before the fit of a roundel at a pixel.
     CameraPrior prior_at(double x, double y) const;
-    /// Learns from the fits of a frame, in its linearized `image`, that contain no light of their own. The
-    /// caller must discard models of earlier frames if `exponent_in_use` changes.
-    void observe(const std::vector<Observation>& roundels, const ImageView& image);
+    /// Learns from the fits of a frame, in its linearized `image`, that contain no light of their own.
+    /// Returns whether fits with what was known before do not compare with the next ones: another tone curve
+    /// is in use. The caller must discard models of earlier frames if `exponent_in_use` changes.
+    bool observe(const std::vector<Observation>& roundels, const ImageView& image);
     /// Adds to a fit's covariance what it does not contain: the correlation of residuals along the edges
     /// (that of the camera's roundels, or the roundel's own if shadows or compression make it larger), and
     /// bends.
@@ -69,9 +73,6 @@ class CameraModel {
         ToneEstimate power;
         ToneSample sample;
     };
-    static double to_power(double level, double exponent) {
-        return 255 * std::pow(std::max(level, 0.0) / 255, exponent);
-    }
     void learn_remainder(const std::vector<ToneSample>& samples);
     struct CurvatureSeen {
         const Print& print;
@@ -85,7 +86,7 @@ class CameraModel {
     bool contradicts(const std::vector<Observation>& roundels);
     void forget_response();
     void forget();
-    void learn_response(const std::vector<const RoundelFit*>& fits);
+    bool learn_response(const std::vector<const RoundelFit*>& fits);
     void set_exponent(double log_exponent);
 
     std::vector<Print> prints_;
