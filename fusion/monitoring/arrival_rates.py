@@ -20,15 +20,13 @@ from fusion.rig_graph.clock_walk import CHANGED_SIGMA
 
 WINDOW_NS = 1_000_000_000  # in which the least lag counts: of 30 frames at 30 Hz
 FEWEST = 5  # frames in it
-LEARNED = (
-    4,
-    9,
-)  # changes from one window to the next by which the next one is predicted: at least, and at most
+# Changes from one window to the next by which the next one is predicted, at least and at most.
+LEARNED = 4, 9
 REMEMBERED = 60  # windows, a minute: a queue that lasts longer looks like a longer way
 CRYSTAL = 1e-4  # rate by which the least lag may rise, and is still that of the clock
 CERTAIN = 3.0  # standard deviations by which a lag is above the least one
-# A normal deviate over its median size, and the standard deviation of Student's distribution with four degrees of
-# freedom, for the few changes that are known; over that of the difference of two changes.
+# The standard deviation of a change over the median difference of successive ones: 1.4826 / 2^1/2 of normal deviates,
+# times that of Student's distribution with four degrees of freedom, 2^1/2, since few changes are known.
 OF_MEDIAN = 1.4826
 
 
