@@ -302,9 +302,14 @@ class MarkerTrack:
 
 def build_tracks(detections: WandDetections, cameras: int, markers: int) -> list[list[MarkerTrack]]:
     """Return tracks by camera and marker, in undistorted image plane coordinates, by timestamps."""
-    rows = group_rows(detections.camera * markers + detections.label, cameras * markers)
+    rows = _rows_of_tracks(detections, cameras, markers)
     tracks = [MarkerTrack.of(detections.t_s[k], detections.xy[k]) for k in rows]
     return [tracks[camera * markers : (camera + 1) * markers] for camera in range(cameras)]
+
+
+def _rows_of_tracks(detections: WandDetections, cameras: int, markers: int) -> list[Index]:
+    """The detections of each track, by camera, then by marker."""
+    return group_rows(detections.camera * markers + detections.label, cameras * markers)
 
 
 def group_rows(number: Index, count: int) -> list[Index]:
@@ -405,8 +410,8 @@ class WandRecording:
     def timed(self) -> Mask:
         """(n,) which detections the uncertainty of their stamps displaces by less than their noise, at the speed of the
         marker's image."""
-        detections, markers = self.detections, len(self.wand.markers)
-        rows = group_rows(detections.camera * markers + detections.label, len(self.lenses) * markers)
+        detections = self.detections
+        rows = _rows_of_tracks(detections, len(self.lenses), len(self.wand.markers))
         focal_px = np.array([(lens.fx + lens.fy) / 2 for lens in self.lenses])
         speed = np.empty(len(detections))
         for mine, track in zip(rows, chain.from_iterable(self.tracks), strict=True):

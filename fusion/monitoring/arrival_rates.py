@@ -73,25 +73,19 @@ class _Lags:
 
     def _end(self) -> ArrivalRate | None:
         """End a window: what its change from the one before shows, by the scatter of the changes before."""
-        before, was_late, earlier = (
-            self.floors[-1] if self.floors else (0, 0.0),
-            self.is_late,
-            list(self.floors),
-        )
+        earlier, was_late, known = list(self.floors), self.is_late, list(self.changes)
         self.floors.append((self.window, self.least_ns))
-        if self.window != before[0] + 1:
+        if not earlier or earlier[-1][0] != self.window - 1:
             return None
-        change_ns, known = self.least_ns - before[1], list(self.changes)
+        change_ns = self.least_ns - earlier[-1][1]
         if len(known) < LEARNED[0]:
             self.changes.append(change_ns)
             return None
         # By the median, so that neither a delay that changed once nor a clock that began to drift makes it large.
         sigma_ns = max(EXACT_NS, OF_MEDIAN * median(abs(b - a) for a, b in pairwise(known)))
-        above_ns = (
-            min(lag + CRYSTAL * WINDOW_NS * (self.window - k) for k, lag in earlier) + CERTAIN * sigma_ns
-        )
+        floor_ns = min(lag + CRYSTAL * WINDOW_NS * (self.window - k) for k, lag in earlier)
         falls_back = change_ns < -CERTAIN * sigma_ns and self.least_ns > min(lag for _, lag in earlier)
-        self.is_late = self.least_ns > above_ns
+        self.is_late = self.least_ns > floor_ns + CERTAIN * sigma_ns
         if self.is_late:
             may_be_slow = change_ns > CERTAIN * sigma_ns
             return ArrivalRate(change_ns / WINDOW_NS, math.inf) if may_be_slow else None

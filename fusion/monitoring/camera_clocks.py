@@ -209,13 +209,11 @@ class CameraClocks:
         """Let no rate be common to most clocks from a time on, and let an offset that is decay: robots show differences
         only, and each departure may leave a part of its offset and rate with the others, which would move all robots
         along their paths for ever."""
-        passed_s, self._held_ns = max(0, t_ns - (self._held_ns or t_ns)) * 1e-9, t_ns
-        if 2 * sum(clock.since_ns > 0 for clock in self._clocks.values()) < len(self._clocks):
-            return  # most clocks are correct
         if rate := _common([clock.rate for clock in self._clocks.values()]):
             for clock in self._clocks.values():
                 clock.correction_s, clock.since_ns = clock.at(t_ns), t_ns
                 clock.rate -= rate
+        passed_s, self._held_ns = max(0, t_ns - (self._held_ns or t_ns)) * 1e-9, t_ns
         offset_s = _common([clock.unexplained_s(t_ns) for clock in self._clocks.values()])
         for clock in self._clocks.values() if offset_s else ():
             clock.correction_s += offset_s * math.expm1(-passed_s / DECAY_S)

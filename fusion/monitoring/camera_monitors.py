@@ -58,11 +58,9 @@ class CameraMonitors:
         admitted = self.clocks.admit(frame)
         return None if admitted is None or self.frozen.is_frozen(admitted, robots_now) else admitted
 
-    def used(self, frame_set: FrameSet, speed_m_s: Callable[[], float]) -> FrameSet:
+    def used(self, frame_set: FrameSet, speed_m_s: float) -> FrameSet:
         """The frame set without the frames of moved cameras, and of those whose time is not known at this speed."""
-        excluded = self.rig.excluded
-        if any(frame.clock_sigma_s or frame.stamp_sigma_s for frame in frame_set.frames):
-            excluded = excluded | uncertain(frame_set, speed_m_s())
+        excluded = self.rig.excluded | uncertain(frame_set, speed_m_s)
         if not excluded:
             return frame_set
         return replace(frame_set, frames=tuple(f for f in frame_set.frames if f.camera not in excluded))
@@ -78,7 +76,7 @@ class CameraMonitors:
         for frame in frame_set.frames:
             if (shown := self._arrivals.add(frame)) is not None:
                 rate = shown.rate - self.clocks.rate(frame.camera)
-                self.rig.hear(frame.camera, frame.t_ns, rate, shown.sigma)
+                self.rig.add_rate(frame.camera, frame.t_ns, rate, shown.sigma)
         corrections = self.rig.check(frame_set, now, fit, recalibrates)
         for departure in self.rig.take_departures():
             self.clocks.correct(departure)

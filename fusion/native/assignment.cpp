@@ -7,8 +7,8 @@
 namespace roundel::fusion {
 namespace {
 
-constexpr double kUnassigned =
-    1e4;  // cost of a marker without a detection: above any sum of costs within gates
+// Cost of a marker without a detection: above any sum of costs within gates.
+constexpr double kUnassigned = 1e4;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 /// The numbers of rows that occur, from 0 without gaps.

@@ -3,6 +3,8 @@
 
 #include <algorithm>
 
+#include "linearization.hpp"
+
 namespace roundel::fusion {
 namespace {
 
@@ -36,8 +38,6 @@ struct Displacement {
     Matrix A;
     int a, b;
 };
-
-constexpr int kTheta = 0, kPosition = 3, kOmega = 6, kVelocity = 9;
 
 Displacement displacement_by_pose(const Vector& position, const Matrix& R) {
     return {R * minus_skew(position), kTheta, kPosition};

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 #pragma once
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 
@@ -22,6 +23,16 @@ struct Columns {
     {
         return {at(0, k), at(1, k), at(2, k)};
     }
+};
+
+/// The factor L of the covariance L L^T of detection k: a in the first row, b and c in the second.
+struct CovarianceFactor {
+    double a, b, c;
+
+    CovarianceFactor(const Columns<4>& cov, size_t k, double added = 0)
+        : a(std::sqrt(cov.at(0, k) + added)),
+          b(cov.at(1, k) / a),
+          c(std::sqrt(cov.at(3, k) + added - b * b)) {}
 };
 
 }  // namespace roundel::fusion

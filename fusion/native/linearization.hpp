@@ -5,8 +5,8 @@
 /// Linearizes observations about the predicted states; see fusion_filter.md.
 namespace roundel::fusion {
 
-constexpr int kErrors =
-    12;  // of a state: rotation (body frame), position, angular velocity, velocity (world)
+// Errors of a state: rotation (body frame), position, angular velocity, velocity (world).
+constexpr int kErrors = 12, kTheta = 0, kPosition = 3, kOmega = 6, kVelocity = 9;
 
 /// Two whitened linear equations A delta = b of the error of one body, each stored as its row of A and then
 /// b. Both are zero where the disc is not visible.

@@ -4,7 +4,6 @@
 namespace roundel::fusion {
 namespace {
 
-constexpr int kTheta = 0, kPosition = 3, kOmega = 6, kVelocity = 9;
 using Block = std::array<std::array<double, 3>, 3>;
 
 Block block_of(const Matrix& A) {

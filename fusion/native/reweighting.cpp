@@ -133,15 +133,11 @@ struct NoisyEquations {
     double nu[2], log_area;
 
     NoisyEquations(const Evidence& evidence, size_t k, double added_px2) {
-        const Columns<4>& cov = evidence.cov;
-        const double uu = cov.at(0, k), uv = cov.at(1, k), vv = cov.at(3, k);
-        const double a = std::sqrt(uu), b = uv / a, c = std::sqrt(vv - b * b);
-        const double a_now = std::sqrt(uu + added_px2), b_now = uv / a_now;
-        const double c_now = std::sqrt(vv + added_px2 - b_now * b_now);
-        log_area = std::log(a_now * c_now);
+        const CovarianceFactor L(evidence.cov, k), noisy(evidence.cov, k, added_px2);
+        log_area = std::log(noisy.a * noisy.c);
         const auto whiten = [&](double x, double y, double& u, double& v) {
-            u = a / a_now * x;
-            v = (b * x + c * y - b_now * u) / c_now;
+            u = L.a / noisy.a * x;
+            v = (L.b * x + L.c * y - noisy.b * u) / noisy.c;
         };
         for (int i = 0; i < kErrors; ++i) whiten(evidence.A[k][0][i], evidence.A[k][1][i], A[0][i], A[1][i]);
         whiten(evidence.nu[k][0], evidence.nu[k][1], nu[0], nu[1]);

@@ -23,7 +23,7 @@ RATE_SIGMA = 1e-3  # of a clock against others, if it is not disciplined: crysta
 # Of an offset, s, and a rate that changed: cameras have stated rates that are 1 % wrong.
 CHANGED_SIGMA = 0.1, 1e-2
 RATE_WALK = 1e-4  # change of a rate in a second: a daemon that slews a clock changes it by 5e-4 at once
-MAX_HEARD = 60  # rates of a clock by arrivals, of half a minute, that wait for keyframes
+MAX_PENDING = 60  # rates of a clock by arrivals that wait for keyframes: one a second, for a minute
 MEMORY_S = 10.0  # of errors of poses and lenses: what they do to offsets varies with the places of robots
 
 
@@ -66,7 +66,8 @@ class ClockWalk:
     def __init__(self, n_cameras: int) -> None:
         self._n, self.departed = n_cameras, list[int]()
         self._t_ns = self._shown_ns = 0  # of the estimate, and of the last keyframes
-        self._heard = deque[tuple[int, int, float, float]](maxlen=MAX_HEARD * n_cameras)
+        # Of rates by arrivals that were not used yet: time, camera, rate and standard deviation.
+        self._pending = deque[tuple[int, int, float, float]](maxlen=MAX_PENDING * n_cameras)
         self.is_suspicious = False
         self._drift = np.zeros(n_cameras)  # rates that explain what the last keyframes show of the offsets
         self.rates = ERRORS * n_cameras + np.arange(n_cameras)
@@ -103,24 +104,22 @@ class ClockWalk:
     def jump(self, camera: int, sigma_s: float, rate_sigma: float) -> None:
         """The stamps of a camera were corrected by a jump with this standard deviation, or may have jumped so far.
         Their rate was corrected until then by as much as `rate_sigma`."""
-        heard = [entry for entry in self._heard if entry[1] != camera]
-        self._heard.clear()
-        self._heard.extend(heard)
+        self._pending = deque((m for m in self._pending if m[1] != camera), self._pending.maxlen)
         self.P[self.offsets[camera], self.offsets[camera]] += sigma_s**2
         self.P[self.rates[camera], self.rates[camera]] += rate_sigma**2
         self._most[self.rates[camera]] = CHANGED_SIGMA[1]
         self._depart(camera)
 
-    def hear(self, t_ns: int, camera: int, rate: float, sigma: float) -> None:
-        """Take the rate of a clock by the arrivals of its frames, which counts with the keyframes after that time. If
-        sigma is infinite, the clock may have that rate: it is as uncertain."""
-        self._heard.append((t_ns, camera, rate, sigma))
+    def add_rate(self, t_ns: int, camera: int, rate: float, sigma: float) -> None:
+        """Add the rate of a clock by the arrivals of its frames, which is used with the first keyframes after that
+        time. If sigma is infinite, the clock may have that rate: it is as uncertain."""
+        self._pending.append((t_ns, camera, rate, sigma))
 
-    def listen(self, t_ns: int) -> None:
-        """Predict to a time, by the rates that were heard until then. A rate beyond chance shows that the clock
+    def predict(self, t_ns: int) -> None:
+        """Predict to a time, with the rates by arrivals until then. A rate beyond chance shows that the clock
         changed, or a delay, which the next ones decide."""
-        while self._heard and self._heard[0][0] <= t_ns:
-            _, camera, rate, sigma = self._heard.popleft()
+        while self._pending and self._pending[0][0] <= t_ns:
+            _, camera, rate, sigma = self._pending.popleft()
             row = self.rates[camera]
             off, variance = rate - self.x[row], self.P[row, row] + sigma**2
             if np.isinf(sigma) or off**2 > chdtri(1, FALSE_ALARM) * variance:
@@ -155,7 +154,7 @@ class ClockWalk:
         forgotten; returns False.
         """
         interval_s = max(0, t_ns - (self._shown_ns or t_ns)) * 1e-9
-        self.listen(t_ns)
+        self.predict(t_ns)
         self._shown_ns, seen = t_ns, slice(0, len(y))
         off, limit = y - H @ self.x[seen], chdtri(len(y), FALSE_ALARM)
         free = np.linalg.solve(H + np.diag(np.tile(FREE_SIGMA**-2, self._n)), off)
@@ -245,8 +244,8 @@ class ClockWalk:
             for _, of_k, s_of_k in [explain([*self.departed, k])]
         ]
         rates = {d.camera: d.rate for d in departures}  # of which stamps are corrected
-        for n, (at_ns, camera, rate, s_rate) in enumerate(self._heard):
-            self._heard[n] = at_ns, camera, rate - rates.get(camera, 0.0), s_rate
+        for n, (at_ns, camera, rate, s_rate) in enumerate(self._pending):
+            self._pending[n] = at_ns, camera, rate - rates.get(camera, 0.0), s_rate
         if self._n > 2:  # of two, the one that departed before departs again
             self.departed = [
                 d.camera for d in departures if d.sigma_s > OFFSET_SIGMA_S or d.rate_sigma > RATE_SIGMA / 2

@@ -204,9 +204,9 @@ class RigMonitor:
         self._walk.jump(self._cameras.index[name], sigma_s, rate_sigma)
         self._forget()
 
-    def hear(self, name: str, t_ns: int, rate: float, sigma: float) -> None:
-        """The rate of a camera's corrected stamps by arrivals; see `ClockWalk.hear`."""
-        self._walk.hear(t_ns, self._cameras.index[name], rate, sigma)
+    def add_rate(self, name: str, t_ns: int, rate: float, sigma: float) -> None:
+        """The rate of a camera's corrected stamps by arrivals; see `ClockWalk.add_rate`."""
+        self._walk.add_rate(t_ns, self._cameras.index[name], rate, sigma)
 
     def check(
         self,
@@ -365,7 +365,7 @@ class RigMonitor:
         refinement.widen(self._scale)
         if verdict.cause == "focal":
             refinement.free_lenses(verdict.cameras)
-        self._walk.listen(measured.clocks[0][0])
+        self._walk.predict(measured.clocks[0][0])
         refinement.update(*measured.errors, *self._walk.offsets_at(measured.errors[0]))
         self._measured_ns = self._given_ns
         if not refinement.is_significant:

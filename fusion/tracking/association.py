@@ -213,12 +213,6 @@ LEARNED = 8  # frames of a camera that define the usual number of detections of 
 # Of a robot or its view in a camera from one frame to the next: hidden, or visible again.
 CHANGED = np.log(0.02)
 CLUTTERED = np.exp(CHANGED)  # other roundels expected in a gate: as probable there as what is judged anyway
-# Sums over the diagonals of these blocks of a covariance, for all robots at once: of its numbers (144,).
-BLOCKS = (POSITION, POSITION), (POSITION, VELOCITY), (VELOCITY, VELOCITY)
-TRACES = np.zeros((12, 12, len(BLOCKS)))
-for _k, (_a, _b) in enumerate(BLOCKS):
-    TRACES[_a, _b, _k] = np.eye(3)
-TRACES = TRACES.reshape(-1, len(BLOCKS))
 
 
 class OwnDetections:
@@ -306,7 +300,10 @@ class OwnDetections:
     def _variance_px2(self, states: States, seen: DetectionTable) -> Array:
         """(R, F) of a coordinate of the predicted images of robots in each frame, px^2, by their positions."""
         camera, tau = seen.exposures.camera, seen.exposures.tau
-        of_p, of_both, of_v = (states.P.reshape(-1, 12 * 12) @ TRACES).T[:, :, None]
+        of_p, of_both, of_v = (
+            np.einsum("nii->n", states.P[:, a, b])[:, None]
+            for a, b in ((POSITION, POSITION), (POSITION, VELOCITY), (VELOCITY, VELOCITY))
+        )
         variance = (of_p + 2 * tau * of_both + tau**2 * of_v) / 3
         off = states.p[:, None] - self._cameras.centres[camera]
         squared_m2 = np.einsum("rfi,rfi->rf", off, off)
@@ -400,7 +397,7 @@ class OwnDetections:
     def _learn(self, count: Index, frames: Index, expected: Mask) -> None:
         """Adapt the usual numbers of expected robots in the cameras that sent frames; forget those of others."""
         known = expected[:, None] & (frames > 0)
-        for column in () if expected.all() else (self._usual, self._learned, self._unseen):
+        for column in (self._usual, self._learned, self._unseen):
             column[~expected] = 0
         self._unseen = np.where(known, count == 0, self._unseen)
         self._learned += known

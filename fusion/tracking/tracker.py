@@ -240,7 +240,8 @@ class Tracker:
         return {self.table.names[k]: self._reasons.get(k, default) for k in missing}
 
     def _used(self, frame_set: FrameSet) -> FrameSet:
-        return self.monitors.used(frame_set, lambda: self.table.speed_m_s)
+        is_known = not any(frame.time_sigma_s for frame in frame_set.frames)
+        return self.monitors.used(frame_set, 0.0 if is_known else self.table.speed_m_s)
 
     def _claim(self) -> None:
         """State the covariances of the robots with the errors of the cameras."""

@@ -203,11 +203,11 @@ Out whiten(const Matrices2& cov, const Matrices2& scale) {
     const auto P = columns<4>(cov, n), scales = columns<4>(scale, n);
     auto [whitened, to] = make({2, 2, n});
     for (size_t k = 0; k < n; ++k) {
-        const double a = std::sqrt(P.at(0, k)), b = P.at(1, k) / a, c = std::sqrt(P.at(3, k) - b * b);
+        const CovarianceFactor L(P, k);
         for (int j = 0; j < 2; ++j) {
-            const double first = scales.at(j, k) / a;
+            const double first = scales.at(j, k) / L.a;
             to[j * n + k] = first;
-            to[(2 + j) * n + k] = (scales.at(2 + j, k) - b * first) / c;
+            to[(2 + j) * n + k] = (scales.at(2 + j, k) - L.b * first) / L.c;
         }
     }
     return whitened;
@@ -219,8 +219,8 @@ Out squared_px(const In<double, -1, 2>& errors, const Matrices2& cov, const Matr
     const auto P = columns<4>(cov, n), scales = columns<4>(whiten, n);
     auto [squares, to] = make({n});
     for (size_t k = 0; k < n; ++k) {  // errors = L^-1 pixels, where L L^T is the covariance
-        const double a = std::sqrt(P.at(0, k)), b = P.at(1, k) / a, c = std::sqrt(P.at(3, k) - b * b);
-        const double u = a * errors(k, 0), v = b * errors(k, 0) + c * errors(k, 1);
+        const CovarianceFactor L(P, k);
+        const double u = L.a * errors(k, 0), v = L.b * errors(k, 0) + L.c * errors(k, 1);
         to[k] = std::isfinite(scales.at(0, k)) ? u * u + v * v : std::numeric_limits<double>::quiet_NaN();
     }
     return squares;

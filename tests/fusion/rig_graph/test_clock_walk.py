@@ -160,7 +160,7 @@ def test_a_clock_departs_by_arrivals_where_robots_hardly_show_it(sigma: float):
         for k in range(10):
             t_ns, offsets = START_NS + k * 10**9, np.array([0.0, -2e-3 * k, 0.0])
             for camera in range(3 if k else 0):
-                walk.hear(t_ns, camera, (-2e-3 if camera == 1 else 0.0) + sigma * rng.normal(), sigma)
+                walk.add_rate(t_ns, camera, (-2e-3 if camera == 1 else 0.0) + sigma * rng.normal(), sigma)
             H, y = about_offsets(offsets + 1e-2 * rng.normal(size=3))
             walk.update(t_ns, H * (SIGMA_S / 1e-2) ** 2, y * (SIGMA_S / 1e-2) ** 2)
             if departures := walk.take_departures():
@@ -176,9 +176,9 @@ def test_a_rate_that_may_be_of_a_delay_is_counted_and_not_believed():
     walk, now_ns = settled(4)
     for seconds in range(3):
         for camera in range(4):
-            walk.hear(now_ns + seconds * 10**9, camera, 0.0, 1e-4)
-    walk.hear(now_ns + 3 * 10**9, 2, 3e-3, np.inf)
-    walk.listen(now_ns + 3 * 10**9)
+            walk.add_rate(now_ns + seconds * 10**9, camera, 0.0, 1e-4)
+    walk.add_rate(now_ns + 3 * 10**9, 2, 3e-3, np.inf)
+    walk.predict(now_ns + 3 * 10**9)
     sigma = np.sqrt(np.diag(walk.P)[walk.rates])
     assert np.abs(walk.x).max() < 1e-12
     assert sigma[2] == pytest.approx(3e-3)
@@ -189,12 +189,12 @@ def test_corrected_stamps_have_another_rate():
     """Arrivals that wait for keyframes show the rate of the stamps as they were: it is corrected in the meantime."""
     walk, now_ns = settled(4, 2)
     walk.departed = [2]
-    walk.hear(now_ns, 2, -1e-3, 1e-4)
+    walk.add_rate(now_ns, 2, -1e-3, 1e-4)
     walk.update(now_ns, *about_offsets(np.zeros(4)))
-    walk.hear(now_ns + 10**9, 2, -1e-3, 1e-4)
+    walk.add_rate(now_ns + 10**9, 2, -1e-3, 1e-4)
     (found,) = (d for d in walk.take_departures() if d.camera == 2)
     assert found.rate < -2e-4
-    walk.listen(now_ns + 10**9)
+    walk.predict(now_ns + 10**9)
     assert walk.x[walk.rates[2]] > -1e-3
 
 
