@@ -135,6 +135,15 @@ def errors_of_size(T: Array) -> Array:
     return grown.ravel()
 
 
+def errors_of_motion(T: Array) -> Array:
+    """(8 C, 6) the errors of cameras at poses T_world_cam (C, 4, 4), by a rotation about the origin and a translation
+    that all have in common, world frame."""
+    moved, into = np.zeros((len(T), ERRORS, 6)), T[:, :3, :3].transpose(0, 2, 1)
+    moved[:, :3, :3] = moved[:, POSITION, 3:] = into
+    moved[:, POSITION, :3] = np.cross(into, into @ T[:, :3, 3:], axis=1)
+    return moved.reshape(-1, 6)
+
+
 def working_ranges(cameras: Sequence[Camera]) -> Array:
     """(C,) distances of placed cameras from the point nearest to all optical axes, metres; from the other cameras where
     these are parallel, and 1 for a single camera."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Continuous calibration: how far the poses and lenses of cameras are from those in use (a Kalman filter).
+"""Continuous calibration: how far the poses and lenses of cameras are from those in use (Kalman filters).
 
-Every robot is a wand: each window of keyframes that contradicts no camera shows the errors of all of them. They wander
-about the calibration, by as much as it states and as a lens is stable. A window that contradicts what is known shows
-that one camera changed, if that explains it better than a change of any other.
+Every robot is a wand: each window of keyframes that contradicts no camera shows the errors of all of them. Poses walk
+at random, because mounts turn and shift; at what rate is unknown too: a filter for each rate, and the windows show which
+is the most likely. Lenses wander about the calibrated ones, as far as a lens is stable. A window that contradicts what is known
+shows that one camera changed, if that explains it better than a change of any other.
 docs/design/rig_graph.md has the equations.
 """
 
@@ -17,8 +18,10 @@ from calib.rig.camera import Camera
 from calib.rig.camera_errors import (
     ERRORS,
     OF_IMAGE,
+    POSITION,
     USUAL_PX,
     error_covariance,
+    errors_of_motion,
     image_metrics,
     own_blocks,
     usual_covariance,
@@ -41,9 +44,14 @@ from fusion.rig_graph.hypotheses import (
 )
 from fusion.rig_graph.keyframes import GATES_PX
 
-# In which errors wander as far as the calibration states: about seven windows count, so an estimate is four seconds
-# old, in which a camera that turns by half a degree an hour moves the image by 0.01 px.
+# In which lenses wander as far as they are stable, and windows count for the rates of mounts.
 MEMORY_S = 60.0
+FIRST_S = 1.0  # before the first window: mounts walked, so that no pose is exact
+# By which the rotation of a camera is another one after a minute, rad: from a mount that windows can't tell from one at
+# rest, to one that turns by half a degree in three minutes.
+RATES = np.array([3e-5, 1e-4, 3e-4, 1e-3]) / 60**0.5
+ARM_M = 1.0  # from a camera to the point about which its mount turns: the foot of a tripod, the end of a bar
+OF_POSE = np.arange(ERRORS) < POSITION.stop
 
 
 class Refinement:
@@ -55,7 +63,7 @@ class Refinement:
 
     Attributes:
         cameras: as they are in use.
-        x, P: (8 C,) estimate and (8 C, 8 C) covariance of the errors.
+        relative: (8 C, 8 C) takes from errors what is common to all cameras: the motion of their frame.
     """
 
     def __init__(self, cameras: Mapping[str, Camera], since: Array) -> None:
@@ -63,10 +71,31 @@ class Refinement:
         self._metrics = image_metrics(given)
         self._stated, self._since, self._scale = error_covariance(given), np.diag(since), 1.0
         self._own = _own_covariance(given, self._metrics)
-        self.x, self.P = np.zeros(len(since)), self._prior
+        self.relative = _relative_to_all(given, self._metrics)
+        self._is_of_pose, self._is_of_lens = np.tile(OF_POSE, len(given)), np.tile(OF_IMAGE & ~OF_POSE, len(given))
+        self._walk = np.square(RATES)[:, None] * np.tile([1.0] * 3 + [ARM_M**2] * 3 + [0.0] * 2, len(given))
+        self._corrected = np.zeros(len(since))  # of poses, and of lenses that are the calibrated ones
+        self._forget()
         self._t_ns = self._n_refused = 0
         self._n_windows = 0.0  # that count
         self._freed = set[int]()  # cameras that changed, and are not corrected yet
+        self._other_lenses = set[int]()  # the same of lenses
+
+    def _forget(self) -> None:
+        """Windows showed nothing: of each rate, estimates, covariances and the logarithm of its likelihood."""
+        self._x = np.zeros((len(RATES), len(self._since)))
+        self._P = np.tile(self._prior, (len(RATES), 1, 1))
+        self._evidence = np.zeros(len(RATES))
+
+    @property
+    def x(self) -> Array:
+        """(8 C,) the estimate of the errors, by the most likely rate."""
+        return self._x[np.argmax(self._evidence)]
+
+    @property
+    def P(self) -> Array:
+        """(8 C, 8 C) its covariance."""
+        return self._P[np.argmax(self._evidence)]
 
     @property
     def _prior(self) -> Array:
@@ -75,20 +104,22 @@ class Refinement:
     def widen(self, scale: float) -> None:
         """The errors are larger than the rig states by a factor."""
         if scale > self._scale:
-            self.P = self.P + (scale**2 - self._scale**2) * self._stated
+            self._P += (scale**2 - self._scale**2) * self._stated
             self._scale = scale
 
     def free_lenses(self, cameras: Sequence[int]) -> None:
         """The focal length of a camera is another one, or those of several are, in common."""
         together = np.zeros(len(self.x))
         together[ERRORS * np.array(cameras) + CAUSES["focal"].start] = FREE_SIGMA[CAUSES["focal"]][0]
-        self.P = self.P + np.outer(together, together)
+        self._P += np.outer(together, together)
+        self._other_lenses.update(cameras)
 
     def _free(self, k: int) -> None:
         """The pose or the lens of a camera is another one."""
         rows = ERRORS * k + np.flatnonzero(OF_IMAGE)
-        self.P[np.ix_(rows, rows)] += (GATES_PX[-1] / USUAL_PX) ** 2 * self._own[np.ix_(rows, rows)]
+        self._P[(..., *np.ix_(rows, rows))] += (GATES_PX[-1] / USUAL_PX) ** 2 * self._own[np.ix_(rows, rows)]
         self._freed.add(k)
+        self._other_lenses.add(k)
 
     def update(self, t_ns: int, H: Array, y: Array, offsets: Array, of_clocks: Array) -> None:
         """Add keyframes.
@@ -99,7 +130,7 @@ class Refinement:
             offsets, of_clocks: (C,) of the clocks, and their covariance (C, C): what is left of them looks like poses,
                 and is the same in all windows, so it counts as many times.
         """
-        self._wander(max(0, t_ns - (self._t_ns or t_ns)) * 1e-9)
+        self._wander(max(0, t_ns - self._t_ns) * 1e-9 if self._t_ns else FIRST_S)
         self._t_ns, identity, clocks = t_ns, np.eye(len(y)), np.flatnonzero(~np.tile(OF_IMAGE, len(offsets)))
         own = self._own.copy()
         own[np.ix_(clocks, clocks)] += self._n_windows * of_clocks
@@ -108,19 +139,37 @@ class Refinement:
         if not self._agrees(H, y - H @ self.x):
             self._n_refused += 1
             if self._n_refused >= CONFIRMED:
-                self.x, self.P, self._n_refused = np.zeros_like(self.x), self._prior, 0
+                self._n_refused = 0
+                self._forget()
                 self._freed.clear()
+                self._other_lenses.clear()
             return
-        off, self._n_refused = y - H @ self.x, 0
-        P = np.linalg.solve(identity + self.P @ H, self.P)
-        self.P = (P + P.T) / 2
-        self.x = self.x + self.P @ off
+        self._n_refused = 0
+        self._add(H, y)
+
+    def _add(self, H: Array, y: Array) -> None:
+        """The update of each filter, by factors of its covariance: errors of clocks and of poses differ by magnitudes.
+        A rate is as likely as its filter predicted the window."""
+        L = np.linalg.cholesky(self._P)
+        with_window = np.eye(len(y)) + L.transpose(0, 2, 1) @ H @ L
+        self._P = L @ np.linalg.solve(with_window, L.transpose(0, 2, 1))
+        off = y - self._x @ H.T
+        step = np.einsum("kij,kj->ki", self._P, off)
+        explained = self._x @ y + np.sum(off * (self._x + step), axis=1)
+        self._evidence += (explained - np.linalg.slogdet(with_window)[1]) / 2
+        self._x = self._x + step
 
     def _wander(self, dt: float) -> None:
-        """An Ornstein-Uhlenbeck process about the rig in use."""
+        """Poses walk at random; lenses are an Ornstein-Uhlenbeck process about the calibrated ones, and clocks about
+        those in use."""
         decay = np.exp(-dt / MEMORY_S)
         self._n_windows = 1 + decay**2 * self._n_windows
-        self.x, self.P = decay * self.x, decay**2 * self.P + (1 - decay**2) * self._prior
+        kept = np.where(self._is_of_pose, 1.0, decay)
+        widened = dt * self._walk + (1 - kept**2) * np.diag(self._prior)
+        calibrated = -self._corrected * self._is_of_lens
+        self._x = calibrated + kept * (self._x - calibrated)
+        self._P = np.outer(kept, kept) * self._P + widened[:, :, None] * np.eye(len(kept))
+        self._evidence *= decay
 
     def _agrees(self, H: Array, off: Array) -> bool:
         """Whether a window agrees with what is known, or shows which camera changed: its pose and its lens are free
@@ -154,16 +203,18 @@ class Refinement:
 
     @property
     def off_px(self) -> Array:
-        """(C,) what the estimated errors displace in the images, RMS of a coordinate."""
-        return self._image_px(np.outer(self.x, self.x))
+        """(C,) what the estimated errors displace in the images, RMS of a coordinate, beside what all have in common:
+        robots do not show that."""
+        x = self.relative @ self.x
+        return self._image_px(np.outer(x, x))
 
     @property
     def is_significant(self) -> bool:
-        """Whether a camera is off by more than the rig states, windows have of their own and is uncertain yet, as each
-        camera that changed is, and none so far that its markers were mistaken."""
-        off_px, usual = self.off_px, np.maximum(self._image_px(self._stated), USUAL_PX)
-        is_known = off_px > LARGE * self._image_px(self.P)
-        is_off = (is_known & (off_px > LARGE * usual)).any()
+        """Whether a camera is off by more than windows have of their own and is uncertain yet, as each camera that
+        changed is, and none so far that its markers were mistaken."""
+        off_px = self.off_px
+        is_known = off_px > LARGE * self._image_px(self.relative @ self.P @ self.relative.T)
+        is_off = (is_known & (off_px > LARGE * USUAL_PX)).any()
         return bool(is_off and (off_px < GATES_PX[-1]).all() and is_known[sorted(self._freed)].all())
 
     def _image_px(self, covariance: Array) -> Array:
@@ -175,17 +226,31 @@ class Refinement:
         errors = self.x.reshape(-1, ERRORS) * OF_IMAGE
         errors[[name in pinned for name in self.cameras]] = 0.0
         errors[np.sqrt(self._metrics[:, 7, 7]) * np.abs(errors[:, 7]) < USUAL_PX, 7] = 0.0
-        self.x = self.x - errors.ravel()
+        self._x, self._corrected = self._x - errors.ravel(), self._corrected + errors.ravel()
+        self._corrected.reshape(-1, ERRORS)[sorted(self._other_lenses), CAUSES["focal"]] = 0.0
         joint, clocks = self.P + self._own + np.outer(self.x, self.x), ~np.tile(OF_IMAGE, len(errors))
+        joint += self._in_common()
         joint[clocks], joint[:, clocks] = self._stated[clocks], self._stated[:, clocks]
         self._stated, self._scale = joint, 1.0
         self._freed.clear()
+        self._other_lenses.clear()
         pairs = zip(self.cameras.items(), errors, strict=True)
         self.cameras = with_errors({name: _displaced(camera, e) for (name, camera), e in pairs}, joint)
         off_px = self._image_px(np.outer(errors, errors))
         worst = int(np.argmax(off_px))
         name, of_worst = list(self.cameras)[worst], tuple(errors[worst].tolist())
         return RigRefinement(self.cameras, name, float(off_px[worst]), of_worst)
+
+    def _in_common(self) -> Array:
+        """(8 C, 8 C) covariance of a motion that all cameras have in common, which robots do not show, since the
+        calibration: mounts moved independently, each by a variance that their motions relative to each other show."""
+        unit = np.tile([1.0] * 3 + [ARM_M] * 3, len(self.cameras))
+        together = errors_of_motion(np.array([camera.matrix() for camera in self.cameras.values()]))
+        A = together[self._is_of_pose] / unit[:, None]
+        moved = self._corrected[self._is_of_pose] / unit
+        relative = moved - A @ np.linalg.lstsq(A, moved, rcond=None)[0]
+        variance = relative @ relative / max(1, len(moved) - A.shape[1])
+        return variance * together @ np.linalg.pinv(A.T @ A, hermitian=True) @ together.T
 
 
 def _displaced(camera: Camera, errors: Array) -> Camera:
@@ -207,6 +272,14 @@ def _gain(score: Array, information: Array, rows: Index, sigma: Array) -> float:
     """
     A, b = np.eye(len(rows)) + sigma[:, None] * information[np.ix_(rows, rows)] * sigma, sigma * score[rows]
     return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
+
+
+def _relative_to_all(cameras: Sequence[Camera], metrics: Array) -> Array:
+    """(8 C, 8 C) that takes from errors of the cameras the motion that explains most of the images of all of them:
+    that of the common frame."""
+    together = errors_of_motion(np.array([camera.matrix() for camera in cameras]))
+    weighted = np.einsum("kij,kjm->kim", metrics, together.reshape(len(cameras), ERRORS, 6)).reshape(-1, 6)
+    return np.eye(len(together)) - together @ np.linalg.pinv(weighted.T @ together, hermitian=True) @ weighted.T
 
 
 def _own_covariance(cameras: Sequence[Camera], metrics: Array) -> Array:
