@@ -72,7 +72,10 @@ class Refinement:
         self._stated, self._since, self._scale = error_covariance(given), np.diag(since), 1.0
         self._own = _own_covariance(given, self._metrics)
         self.relative = _relative_to_all(given, self._metrics)
-        self._is_of_pose, self._is_of_lens = np.tile(OF_POSE, len(given)), np.tile(OF_IMAGE & ~OF_POSE, len(given))
+        self._is_of_pose, self._is_of_lens = (
+            np.tile(OF_POSE, len(given)),
+            np.tile(OF_IMAGE & ~OF_POSE, len(given)),
+        )
         self._walk = np.square(RATES)[:, None] * np.tile([1.0] * 3 + [ARM_M**2] * 3 + [0.0] * 2, len(given))
         self._corrected = np.zeros(len(since))  # of poses, and of lenses that are the calibrated ones
         self._forget()
@@ -217,6 +220,13 @@ class Refinement:
         is_off = (is_known & (off_px > LARGE * USUAL_PX)).any()
         return bool(is_off and (off_px < GATES_PX[-1]).all() and is_known[sorted(self._freed)].all())
 
+    @property
+    def excess(self) -> float:
+        """By how much the errors of a camera may be larger than the rig states, if it is off but not known yet, or 1."""
+        off_px, sigma_px = self.off_px, self._image_px(self.relative @ self.P @ self.relative.T)
+        ratios = np.hypot(off_px, sigma_px) / np.maximum(self._image_px(self._stated), USUAL_PX)
+        return max(1.0, float(ratios[off_px > LARGE * USUAL_PX].max(initial=1.0)))
+
     def _image_px(self, covariance: Array) -> Array:
         return np.sqrt(np.einsum("kij,kij->k", own_blocks(covariance), self._metrics))
 
@@ -279,7 +289,9 @@ def _relative_to_all(cameras: Sequence[Camera], metrics: Array) -> Array:
     that of the common frame."""
     together = errors_of_motion(np.array([camera.matrix() for camera in cameras]))
     weighted = np.einsum("kij,kjm->kim", metrics, together.reshape(len(cameras), ERRORS, 6)).reshape(-1, 6)
-    return np.eye(len(together)) - together @ np.linalg.pinv(weighted.T @ together, hermitian=True) @ weighted.T
+    return (
+        np.eye(len(together)) - together @ np.linalg.pinv(weighted.T @ together, hermitian=True) @ weighted.T
+    )
 
 
 def _own_covariance(cameras: Sequence[Camera], metrics: Array) -> Array:

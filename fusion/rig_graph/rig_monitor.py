@@ -118,9 +118,8 @@ class RigMonitor:
         self._is_confirmed = False  # whether the job confirms a judgement
         self._is_of_wand = False  # whether what contradicts is the size of the rig
         self._size_m = 0.0  # of what contradicts, at the robots
-        self._scale = (
-            1.0  # of the rig's errors, accepted; claims may count them larger while nothing is decided
-        )
+        self._scale = 1.0  # of the rig's errors, accepted
+        self._claimed = 1.0  # the same, larger while nothing is decided
         self._doubted: set[str] = set()  # cameras that contradicted each other when claims grew
         self.is_settled, self.refines = False, True
         self.executor: Executor | None = None
@@ -136,7 +135,8 @@ class RigMonitor:
         self._shapes.inherit(old._shapes, same)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
         self._moved = old._moved
-        self._scale, self._doubted, self._refinement = old._scale, old._doubted, old._refinement
+        self._scale, self._claimed, self._doubted = old._scale, old._claimed, old._doubted
+        self._refinement = old._refinement
         self._cameras.count_errors(old._cameras.error_scale, old._cameras.size_error)
 
     def inherit_poses(self, old: "RigMonitor") -> None:
@@ -391,15 +391,17 @@ class RigMonitor:
         return tuple(window.names[k] for k in verdict.cameras)
 
     def _scale_claims(self, window: Window, verdict: Verdict, names: tuple[str, ...]) -> None:
-        """Let claims count the errors of the rig as large as the window shows them."""
+        """Let claims count the errors of the rig as large as the window shows them, or as all windows do that can't
+        correct them yet."""
         self._doubted |= set(names if names or not verdict.is_of_rig else window.names)
         fall = AGREED_FALL if self._doubted <= set(seeing(window)) else FALL
-        scales = next_scales(self._scale, self._cameras.error_scale, verdict, self._n_undecided > 1, fall)
-        self._scale, claimed = scales
-        if self._scale == claimed:
+        is_confirmed = self._n_undecided > 1
+        self._scale, self._claimed = next_scales(self._scale, self._claimed, verdict, is_confirmed, fall)
+        if self._scale == self._claimed:
             self._doubted.clear()
+        may_be = self._refinement.excess if self._refinement is not None else 1.0
         size_error = abs(verdict.size) or self._cameras.size_error * fall
-        self._cameras.count_errors(claimed, size_error)
+        self._cameras.count_errors(max(self._claimed, may_be), size_error)
 
     def _states_errors(self) -> bool:
         return any(c.errors or c.covariance for c in self._cameras.as_dict().values())
@@ -408,7 +410,7 @@ class RigMonitor:
         """The cameras, if their errors are larger than the rig states, or, where it states none, so large that markers
         may be mistaken."""
         least = LARGE if self._states_errors() else GATES_PX[-1] / USUAL_PX
-        return self._cameras.names if self._cameras.error_scale >= least else ()
+        return self._cameras.names if self._claimed >= least else ()
 
     def _returned(self, window: Window) -> tuple[ExtrinsicsCorrection, ...]:
         """The excluded cameras that agree with the others, as they were: nothing is at fault in the window."""
@@ -546,7 +548,7 @@ class RigMonitor:
         self._refinement = None
         self._shapes.forget()
         self._is_contradicted, self._n_undecided = False, 0
-        self._scale = 1.0
+        self._scale = self._claimed = 1.0
         self._cameras.count_errors(1.0, 0.0)
         self._doubted.clear()
         self._clocks.clear()

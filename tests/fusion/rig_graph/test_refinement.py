@@ -180,6 +180,22 @@ def test_what_a_clock_may_explain_is_no_pose(sigma_s: float, least: float, most:
     assert least <= refinement.x[0] <= most
 
 
+def test_errors_that_are_not_known_are_claimed():
+    """Windows show by how much two cameras turn together, 1 mrad, and not which of them does."""
+    cameras, seen = ring(4), np.zeros(4 * ERRORS)
+    seen[0] = seen[ERRORS] = 1.0
+    H, refinement = np.outer(seen, seen) / 2e-5**2, Refinement(cameras, since(4))
+    assert refinement.excess == 1.0
+    refinement.widen(8.0)
+    for k in range(3):
+        refinement.update(START_NS + k * WINDOW_NS, H, 1e-3 * H[:, 0], np.zeros(4), np.zeros((4, 4)))
+    assert not refinement.is_significant
+    off_px = image_px(
+        refinement.relative @ np.eye(4 * ERRORS)[0] * 1e-3, image_metrics(list(cameras.values()))
+    )
+    assert refinement.excess * USUAL_PX > off_px[0] / 2  # as large as if either of them turned by half
+
+
 def test_an_offset_that_is_known_is_no_pose():
     cameras, seen = ring(4), np.zeros(4 * ERRORS)
     seen[0], seen[6] = 1.0, 0.1
