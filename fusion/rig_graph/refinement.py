@@ -2,9 +2,9 @@
 """Continuous calibration: how far the poses and lenses of cameras are from those in use (Kalman filters).
 
 Every robot is a wand: each window of keyframes that contradicts no camera shows the errors of all of them. Poses walk
-at random, because mounts turn and shift; at what rate is unknown too: a filter for each rate, and the windows show which
-is the most likely. Lenses wander about the calibrated ones, as far as a lens is stable. A window that contradicts what is known
-shows that one camera changed, if that explains it better than a change of any other.
+at random, because mounts turn and shift. At what rate is unknown too: there is a filter for each rate, and windows show
+which is the most likely. Lenses wander about the calibrated ones, as far as a lens is stable. A window that contradicts
+what is known shows that one camera changed, if that explains it better than a change of any other.
 docs/design/rig_graph.md has the equations.
 """
 
@@ -72,10 +72,8 @@ class Refinement:
         self._stated, self._since, self._scale = error_covariance(given), np.diag(since), 1.0
         self._own = _own_covariance(given, self._metrics)
         self.relative = _relative_to_all(given, self._metrics)
-        self._is_of_pose, self._is_of_lens = (
-            np.tile(OF_POSE, len(given)),
-            np.tile(OF_IMAGE & ~OF_POSE, len(given)),
-        )
+        self._is_of_pose = np.tile(OF_POSE, len(given))
+        self._is_of_lens = np.tile(OF_IMAGE & ~OF_POSE, len(given))
         self._walk = np.square(RATES)[:, None] * np.tile([1.0] * 3 + [ARM_M**2] * 3 + [0.0] * 2, len(given))
         self._corrected = np.zeros(len(since))  # of poses, and of lenses that are the calibrated ones
         self._forget()
@@ -222,7 +220,7 @@ class Refinement:
 
     @property
     def excess(self) -> float:
-        """By how much the errors of a camera may be larger than the rig states, if it is off but not known yet, or 1."""
+        """By how much errors may be larger than the rig states where a camera is off but not known yet; 1 else."""
         off_px, sigma_px = self.off_px, self._image_px(self.relative @ self.P @ self.relative.T)
         ratios = np.hypot(off_px, sigma_px) / np.maximum(self._image_px(self._stated), USUAL_PX)
         return max(1.0, float(ratios[off_px > LARGE * USUAL_PX].max(initial=1.0)))
@@ -252,8 +250,8 @@ class Refinement:
         return RigRefinement(self.cameras, name, float(off_px[worst]), of_worst)
 
     def _in_common(self) -> Array:
-        """(8 C, 8 C) covariance of a motion that all cameras have in common, which robots do not show, since the
-        calibration: mounts moved independently, each by a variance that their motions relative to each other show."""
+        """(8 C, 8 C) covariance of the motion since the calibration that all cameras have in common, which robots do
+        not show: mounts moved independently, by a variance that their motions relative to each other show."""
         unit = np.tile([1.0] * 3 + [ARM_M] * 3, len(self.cameras))
         together = errors_of_motion(np.array([camera.matrix() for camera in self.cameras.values()]))
         A = together[self._is_of_pose] / unit[:, None]
