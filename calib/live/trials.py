@@ -4,20 +4,17 @@
 Covariances are inversely proportional to the number of frames, which predicts the result of all frames.
 """
 
-import os
-import signal
-import threading
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context, parent_process
 
 from calib.errors import CalibrationError
 from calib.rig.rig import Rig
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.scale import Distance
+from camera_node.foundation.background_process import BackgroundProcess
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
@@ -79,26 +76,12 @@ class Trial:
     until_s: float = 0.0
 
 
-def _init_trial_process() -> None:
-    """Run at low priority, so that cameras keep the processor, leave Ctrl-C to the main process, and end with it."""
-    os.nice(10)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, name="end with the parent", daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """Without this the process of a killed session waits for its next trial for ever."""
-    if (parent := parent_process()) is not None:
-        parent.join()
-        os._exit(1)
-
-
 class TrialSolver:
     """Computes trials, one at a time, in a process of its own; a process that ends early is replaced."""
 
     def __init__(self, settings: WandSession) -> None:
         self._settings = settings
-        self._executor = _one_process() if settings.trials else None
+        self._executor = BackgroundProcess() if settings.trials else None
         self._running: Future[Trial] | None = None
         self._latest: Trial | None = None
         self._next_s, self._begun_s = settings.trial_every_s, 0.0
@@ -122,18 +105,9 @@ class TrialSolver:
         if self._running is None and now_s >= self._next_s and messages:
             part = select_blocks(messages)
             share = len(part) / len(messages)
-            self._running, self._begun_s = self._submit(self._executor, part, share), now_s
+            self._running = self._executor.submit(compute_trial, self._settings, part, share)
+            self._begun_s = now_s
         return self._latest
-
-    def _submit(
-        self, executor: ProcessPoolExecutor, part: Sequence[Detections], share: float
-    ) -> Future[Trial]:
-        """Start a trial, in another process if that of the last one has ended."""
-        try:
-            return executor.submit(compute_trial, self._settings, part, share)
-        except BrokenExecutor:
-            self._executor = _one_process()
-            return self._executor.submit(compute_trial, self._settings, part, share)
 
 
 def _collect(finished: Future[Trial]) -> Trial:
@@ -142,10 +116,6 @@ def _collect(finished: Future[Trial]) -> Trial:
         return finished.result(0)
     except BrokenExecutor as error:
         return Trial(fault=f"the process of the trials ended ({error}); the session continues")
-
-
-def _one_process() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, get_context("spawn"), _init_trial_process)
 
 
 def select_blocks(messages: Sequence[Detections], frames: int = TRIAL_FRAMES) -> list[Detections]:

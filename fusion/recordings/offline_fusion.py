@@ -28,7 +28,7 @@ from fusion.model.limits import Limits
 from fusion.model.robots import Robot
 from fusion.protocol.pose_messages import FusedFrames
 from fusion.recordings.arena_recording import DETECTIONS, FRAMES, ArenaRecording, skipped
-from fusion.rig_graph.judge_process import RecordedJudgements
+from fusion.rig_graph.recorded_judgements import RecordedJudgements
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Refusal, admit
 from fusion.tracking.result import NO_SOLUTION, TOO_MANY_UNASSIGNED, TrackingResult

@@ -46,7 +46,6 @@ from fusion.rig_graph.hypotheses import (
     fit,
     retract,
 )
-from fusion.rig_graph.judge_process import done
 from fusion.rig_graph.judgements import (
     WINDOWS,
     Judgement,
@@ -59,6 +58,7 @@ from fusion.rig_graph.judgements import (
     watch,
 )
 from fusion.rig_graph.keyframes import GATES_PX, Keyframes
+from fusion.rig_graph.recorded_judgements import done
 from fusion.rig_graph.refinement import Refinement
 from fusion.rig_graph.robot_shapes import RobotShapes
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from calib.rig.rig_messages import RigMessage
+from camera_node.foundation.background_process import BackgroundProcess
 from camera_node.foundation.errors import ConfigError, RoundelError
 from camera_node.foundation.folder_lock import locked_folder
 from camera_node.foundation.logs import about
@@ -38,7 +39,6 @@ from fusion.protocol.pose_messages import (
     robots_digest,
     robots_key,
 )
-from fusion.rig_graph.judge_process import JudgeProcess
 from fusion.server.arena_config import ArenaConfig
 from fusion.server.arena_queries import ArenaQueries, CameraQueries
 from fusion.server.fair_use import FrameQuotas
@@ -131,7 +131,7 @@ class Server:
         with (
             ServiceManager() as service,
             collecting_between_frame_sets() as collect_garbage,
-            JudgeProcess() as judge,
+            BackgroundProcess() as judge,
         ):
             self.pipeline.judge_cameras_in(judge)
             service.ready()

@@ -21,10 +21,10 @@ import numpy as np
 import tyro
 
 from camera_node.foundation.arrays import Array
+from camera_node.foundation.background_process import BackgroundProcess
 from camera_node.protocol.messages import Detections, Keys, encode
 from fusion.model.frames import FrameSet
 from fusion.protocol.pose_messages import Latency, RobotPose, TrackingState
-from fusion.rig_graph.judge_process import JudgeProcess
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.server.ingest import Ingest
 from fusion.server.server import MAX_LAG_NS, collecting_between_frame_sets
@@ -121,7 +121,7 @@ class Queue:
         self._keys, self._statistics = Keys("load"), ServerStatistics()
         self._ingest = Ingest(self._keys, self._statistics)
         self.tracker = Tracker(load.rig, load.bodies)
-        self.tracker.monitors.rig.executor = JudgeProcess()
+        self.tracker.monitors.rig.executor = BackgroundProcess()
         rate_hz = rate_hz or load.hz
         self.synchronizer = FrameSynchronizer(round(1e9 / rate_hz))
         self.free_ns = self.busy_ns = self._first_ns = self._collected_ns = 0

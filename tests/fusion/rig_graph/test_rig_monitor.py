@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from camera_node.foundation.background_process import BackgroundProcess
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.corrections import ExtrinsicsCorrection
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.states import POSITION, FrameSetFit, Snapshot
 from fusion.rig_graph.hypotheses import CAUSES, CONFIRMED, RIVAL, Verdict
-from fusion.rig_graph.judge_process import JudgeProcess
 from fusion.rig_graph.judgements import WINDOWS, judge_latest, watch
 from fusion.rig_graph.keyframes import Keyframe, Keyframes
 from fusion.rig_graph.robot_shapes import RobotShapes
@@ -311,7 +311,7 @@ def test_keyframes_in_which_no_marker_is_assigned_show_nothing():
 
 def test_a_process_that_judges_is_started_again_after_it_was_killed():
     """A job that it took with it fails, as the monitor expects."""
-    with JudgeProcess() as judge:
+    with BackgroundProcess() as judge:
         first = judge.submit(os.getpid).result(DEADLINE_S)
         os.kill(first, signal.SIGKILL)
         with contextlib.suppress(BrokenExecutor):  # unless the end was noticed before the job came
