@@ -7,7 +7,9 @@ CODE_SECTORS: int
 CODE_RADII: tuple[float, float]  # of the ring of sectors, outer radii of the roundel
 
 def code_words() -> list[int]: ...  # see `geometry.codes`
-def are_plausible(uv: bytes, cov: bytes, most: float) -> bool: ...
+def fault_of_detections(
+    max_rows: int, max_variance: float, /, *columns: bytes
+) -> str: ...  # empty if there is none
 def unpack_detections(
     uv: bytes,
     cov: bytes,

@@ -90,15 +90,11 @@ class BodyFit:
     def estimates(self) -> tuple[Array, Array]:
         """R (B, 3, 3), and p, omega and v (3, B, 3)."""
 
-    def covariances(self, P: Array, /) -> Array:
-        """P (B, 12, 12) with those of the bodies that have observations; raises RuntimeError as `inverses`."""
-
-    def costs(self, squared: Array, /) -> Array:
-        """(B,) robust costs of the centres, whose squared residuals (N,) are in standard deviations, NaN where not
-        visible, and of the displacements from the predictions."""
-
-    def centres(self) -> tuple[Array, Array, Array]:
-        """The last equations of the centres (N, 2, 13), their weights (N,) and whitened residuals (N, 2)."""
+    def result(self, P: Array, cov: Array, /) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+        """The `estimates`; P (B, 12, 12) with the covariances of the bodies that have observations, if these are not
+        singular; of the centres, with covariances cov (2, 2, N), px^2, the last equations (N, 2, 13), their weights
+        (N,) and squared residuals (N,), px^2, NaN where not visible; and the robust costs (B,) of the centres and of
+        the displacements from the predictions."""
 
 def whiten(cov: Array, scale: Array, /) -> Array:
     """(2, 2, N) L^-1 scale of N detections, where L L^T is the covariance; cov and scale (2, 2, N)."""
@@ -208,23 +204,22 @@ class MarkerCloud:
         are none.
         """
 
-def measure(
-    cells: Array,
-    cell_px: float,
-    error_px: float,
-    uv: Array,
-    cov: Array,
-    axes: Array,
-    angle: Array,
-    id: NDArray[np.int32],
-    probability: Array,
-    rotation: Array,
-    sigma: Array,
+def detection_columns(
+    uv: bytes,
+    cov: bytes,
+    axes_px: bytes,
+    angle_rad: bytes,
+    id: bytes,
+    id_probability: bytes,
+    rotation_rad: bytes,
+    rotation_sigma: bytes,
     /,
-) -> tuple[Array, bool]:
-    """(19, N) columns of a `DetectionTable` without delays, from those of `Roundels`: NaN where outlines are impossible
-    or cells are empty; and whether no cell is. `error_px`: of the table, added to the covariances. cells (rows + 2,
-    columns + 2, 20): see `native/inverse_lens.hpp`."""
+) -> Array:
+    """(19, N) columns of a `DetectionTable`, of those of `Detections`, before `undistort`."""
+
+def undistort(cells: Array, cell_px: float, added_px2: float, columns: Array, /) -> bool:
+    """Write the undistorted coordinates, NaN outside the cells and in place of impossible outlines, and add to the
+    variances; returns whether all coordinates are known."""
 
 def shears(axes: Array, angle: Array, centre: Array, normal: Array, radius: Array, scale: Array, /) -> Array:
     """(2, N) shears of measured ellipses relative to discs with centre and normal (3, N), camera frame."""
@@ -266,7 +261,6 @@ def eliminate_robots(
 def respond(
     poses: FramePoses,
     camera: Index,
-    n_cameras: int,
     equations: Array,
     weights: Array,
     rig_share: Array,
@@ -281,19 +275,19 @@ def respond(
     responses: Array,
     counted: Array,
     /,
-) -> tuple[Array, Array]:
-    """The responses (B, 12, 8 C) of B bodies to the errors of C cameras after a filter's step, and the parts
-    (B, 12, 12) of P that count these errors as noise: `responses` and `counted` are those before it.
+) -> None:
+    """Updates the responses (B, C, 12, 8) of B bodies to the errors of C cameras, and the parts (B, 12, 12) of P that
+    count these errors as noise, by a filter's step.
 
     camera (F,) of the frames; equations (N, 2, 13) of N centres, their weights, shares of the variances that are
     counted for the cameras, frames and bodies (N,), xy (2, N) and whiten (2, 2, N); information of the predictions and
     P after the update (B, 12, 12); T (B, 3, 3) and dt (B,): see `fusion.model.states.Transition`.
     """
 
-def consider(P: Array, counted: Array, responses: Array, factor: Array, /) -> Array:
+def consider(P: Array, counted: Array, responses: Array, factor: Array, R: Array, frame: Array, /) -> Array:
     """(B, 12, 12) covariances of B bodies with the errors of C cameras, whose covariance has the lower triangular
-    factor (8 C, 8 C): P without the part that counts these as noise. See `respond`.
-    """
+    factor (8 C, 8 C), in place of the part of P that counts these as noise (see `respond`), and with the errors of
+    the bodies' own frames (B, 6, 6), body frame, which R (B, 3, 3) turns into the world."""
 
 def are_own(
     A: Array,

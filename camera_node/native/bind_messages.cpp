@@ -2,12 +2,14 @@
 #include "bind_messages.hpp"
 
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
 
 #include <algorithm>
 #include <bit>
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <string>
 
 namespace nb = nanobind;
 
@@ -26,9 +28,7 @@ T number(const nb::bytes& column, size_t k) {
 
 /// Whether all centres (pairs of doubles) are finite, and covariances (floats uu, uv, vv) positive definite
 /// and below `most` square pixels.
-bool are_plausible(const nb::bytes& uv, const nb::bytes& cov, double most) {
-    const size_t n = uv.size() / (2 * sizeof(double));
-    if (cov.size() != 3 * n * sizeof(float)) throw nb::value_error("columns of different lengths");
+bool are_plausible(const nb::bytes& uv, const nb::bytes& cov, size_t n, double most) {
     for (size_t k = 0; k < n; ++k) {
         const double uu = number<float>(cov, 3 * k), mixed = number<float>(cov, 3 * k + 1),
                      vv = number<float>(cov, 3 * k + 2);
@@ -37,6 +37,35 @@ bool are_plausible(const nb::bytes& uv, const nb::bytes& cov, double most) {
             if (!(std::abs(number<double>(uv, i)) < kMaxCoordinate)) return false;
     }
     return true;
+}
+
+/// What is wrong with the columns of `Detections`, of which a message has `max_rows` at most; empty if
+/// nothing is. Those of codes may be empty. Comparisons with NaN, which is an unknown value, are false.
+std::string fault_of_detections(size_t max_rows, double max_variance, const nb::bytes& uv,
+                                const nb::bytes& cov, const nb::bytes& axes_px, const nb::bytes& angle_rad,
+                                const nb::bytes& ratio, const nb::bytes& contrast, const nb::bytes& id,
+                                const nb::bytes& track, const nb::bytes& id_probability,
+                                const nb::bytes& rotation_rad, const nb::bytes& rotation_sigma) {
+    const size_t n = uv.size() / (2 * sizeof(double));
+    if (n > max_rows) return "too many roundels";
+    const auto has = [n](const nb::bytes& column, size_t bytes) { return column.size() == n * bytes; };
+    bool agree = has(uv, 16) && has(cov, 12) && has(axes_px, 8);
+    for (const nb::bytes* column : {&angle_rad, &ratio, &contrast, &id, &track}) agree &= has(*column, 4);
+    for (const nb::bytes* column : {&id_probability, &rotation_rad, &rotation_sigma})
+        agree &= column->size() == 0 || has(*column, 4);
+    if (!agree) return "columns of different lengths";
+    if (!are_plausible(uv, cov, n, max_variance)) return "a centre or a covariance is NaN or out of range";
+    const auto any = [](const nb::bytes& column, const auto& is_wrong) {
+        for (size_t k = 0; k < column.size() / sizeof(float); ++k)
+            if (is_wrong(number<float>(column, k))) return true;
+        return false;
+    };
+    if (any(rotation_sigma, [](float sigma) { return sigma <= 0; }) ||
+        any(id_probability, [](float p) { return p < 0 || p > 1; }))
+        return "a code's probability or standard deviation is out of range";
+    if (any(rotation_rad, [](float angle) { return std::isinf(angle); }))
+        return "a code's rotation is infinite";
+    return "";
 }
 
 /// Appends the rows of a column, of whose numbers each row has those in this order.
@@ -72,6 +101,6 @@ nb::object unpack_detections(const nb::bytes& uv, const nb::bytes& cov, const nb
 }  // namespace
 
 void bind_messages(nb::module_& m) {
-    m.def("are_plausible", &are_plausible);
+    m.def("fault_of_detections", &fault_of_detections);
     m.def("unpack_detections", &unpack_detections);
 }

@@ -211,20 +211,11 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Raise MessageError unless sizes agree, centres are finite and covariances positive definite and small."""
-        self._check_sizes()
         self._check_header()
-        if not _core.are_plausible(self.uv, self.cov, MAX_VARIANCE_PX2):
-            raise MessageError("a centre or a covariance is NaN or out of range")
-        if any(getattr(self, name) for name in self.OPTIONAL):
-            self._check_codes()
-
-    @np.errstate(invalid="ignore")  # the conversion turns signalling NaNs into quiet ones
-    def _check_codes(self) -> None:
-        probability, sigma = self._column("id_probability"), self._column("rotation_sigma")
-        if (sigma <= 0).any() or (probability < 0).any() or (probability > 1).any():
-            raise MessageError("a code's probability or standard deviation is out of range")
-        if np.isinf(self._column("rotation_rad")).any():
-            raise MessageError("a code's rotation is infinite")
+        shape = self.uv, self.cov, self.axes_px, self.angle_rad, self.ratio, self.contrast
+        codes = self.id, self.track, self.id_probability, self.rotation_rad, self.rotation_sigma
+        if fault := _core.fault_of_detections(self.MAX_ROWS, MAX_VARIANCE_PX2, *shape, *codes):
+            raise MessageError(fault)
 
     def _check_header(self) -> None:
         if not (is_name(self.camera) and 0 < self.width <= 32768 and 0 < self.height <= 32768):

@@ -12,7 +12,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Index
 from camera_node.geometry.lens import Lens
 from camera_node.protocol.messages import Detections
-from fusion.model.undistortion import measure
+from fusion.model.undistortion import UV, columns_of, undistort
 
 MAX_CLOCK_ERROR_S = 0.1  # a stamp with a larger bound has this one; NaN is an unknown bound
 
@@ -23,6 +23,7 @@ class CalibratedFrame:
 
     Attributes:
         t_ns: capture time including the calibrated offset of the camera.
+        detected: what the camera sent, or the roundels of a simulation.
         columns: (19, N) of a `DetectionTable`, without the errors of cameras and without delays.
         stamp_ns: capture time as the camera published it; 0 without a message.
         sent_ns, received_ns: times of the message; 0 offline.
@@ -34,7 +35,7 @@ class CalibratedFrame:
 
     camera: str
     t_ns: int
-    roundels: Roundels
+    detected: Detections | Roundels
     columns: Array
     stamp_ns: int = 0
     sent_ns: int = 0
@@ -51,7 +52,7 @@ class CalibratedFrame:
         return cls.measure(
             message.camera,
             camera.capture_ns(message.t_ns, message.sent_ns),
-            message.unpack(),
+            message,
             camera,
             stamp_ns=message.t_ns,
             sent_ns=message.sent_ns,
@@ -64,10 +65,15 @@ class CalibratedFrame:
 
     @classmethod
     def measure(
-        cls, name: str, t_ns: int, roundels: Roundels, lens: Lens, **timing: Any
+        cls, name: str, t_ns: int, detected: Detections | Roundels, lens: Lens, **timing: Any
     ) -> "CalibratedFrame":
         """The frame of roundels from the camera `name` with this lens; `timing` sets the remaining fields."""
-        return cls(name, t_ns, roundels, measure(lens, roundels), **timing)
+        return cls(name, t_ns, detected, undistort(lens, columns_of(detected)), **timing)
+
+    @property
+    def roundels(self) -> Roundels:
+        """As they were detected."""
+        return self.detected.unpack() if isinstance(self.detected, Detections) else self.detected
 
     @property
     def time_sigma_s(self) -> float:
@@ -76,19 +82,20 @@ class CalibratedFrame:
 
     def select(self, rows: Index) -> "CalibratedFrame":
         """The frame with some of its roundels."""
-        return replace(self, roundels=self.roundels.select(rows), columns=self.columns[:, rows])
+        return replace(self, detected=self.roundels.select(rows), columns=self.columns[:, rows])
 
     def recalibrated(self, old: Camera, new: Camera) -> "CalibratedFrame":
         """The frame by another calibration of its camera."""
         stamp_ns = self.stamp_ns or self.t_ns
         before_ns, after_ns = (camera.capture_ns(stamp_ns, self.sent_ns) for camera in (old, new))
-        return replace(self, t_ns=self.t_ns + after_ns - before_ns, columns=measure(new, self.roundels))
+        columns = undistort(new, self.columns.copy(), added_px2=0.0)
+        return replace(self, t_ns=self.t_ns + after_ns - before_ns, columns=columns)
 
     def delays(self, lens: Lens) -> Array:
         """(N,) times from `t_ns` to the capture of each roundel's row, seconds."""
         if not self.readout_s:
-            return np.zeros(len(self.roundels))
-        return self.readout_s * lens.image_row(self.roundels.uv)
+            return np.zeros(self.columns.shape[1])
+        return self.readout_s * lens.image_row(self.columns[UV].T)
 
 
 def clock_sigma_s(error_us: float) -> float:

@@ -16,6 +16,7 @@ from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.outline import centre_shifts, half_axes_of
+from camera_node.protocol.messages import Detections
 from fusion import _core
 
 CELL_PX, FINE_CELL_PX = 32, 16
@@ -44,22 +45,37 @@ UV, COV, OUTLINE, XY, SCALE = slice(2), slice(2, 6), slice(6, 9), slice(9, 11), 
 CODE, ROTATION, ROTATION_SIGMA, DELAY, N_ROWS = *range(15, 19), 19
 
 
-def measure(lens: Lens, roundels: Roundels) -> Array:
-    """Undistort N detected roundels.
+def columns_of(detected: Detections | Roundels) -> Array:
+    """(19, N) columns of a `DetectionTable` of N roundels, before `undistort`. A number without a probability comes
+    from a file and is no code."""
+    d = detected
+    if isinstance(d, Detections):
+        code = d.id, d.id_probability, d.rotation_rad, d.rotation_sigma
+        return _core.detection_columns(d.uv, d.cov, d.axes_px, d.angle_rad, *code)
+    columns = np.zeros((N_ROWS, len(d)))
+    columns[UV], columns[COV], columns[OUTLINE] = d.uv.T, d.cov.reshape(-1, 4).T, (*d.axes_px.T, d.angle_rad)
+    columns[CODE] = np.where(np.isfinite(d.id_probability), d.id, -1)
+    columns[ROTATION], columns[ROTATION_SIGMA] = d.rotation_rad, d.rotation_sigma
+    return columns
+
+
+def undistort(lens: Lens, columns: Array, added_px2: float = TOLERANCE_PX**2) -> Array:
+    """Undistort N roundels.
 
     Args:
         lens: lens model of the camera.
-        roundels: in raw pixels.
+        columns: (19, N) of a `DetectionTable`, without the errors of cameras and without delays; their undistorted
+            coordinates and Jacobians are written.
+        added_px2: is added to the covariances, unless they contain it: the error of the table. Cameras may claim that
+            they have hardly any, and equations with such weights are singular.
 
     Returns:
-        (19, N) columns of a `DetectionTable`, without the errors of cameras and without delays. Centres of the
-        undistorted ellipses (`camera_node.geometry.outline`) are within `TOLERANCE_PX` of those by `Lens.normalise`;
-        they are the undistorted centres where axes are unknown or impossible, and NaN where the lens has no inverse.
-        Covariances contain the error `TOLERANCE_PX` too: cameras may claim that they have hardly any, and equations
-        with such weights are singular.
+        the columns. Centres of the undistorted ellipses (`camera_node.geometry.outline`) are within `TOLERANCE_PX` of
+        those by `Lens.normalise`; they are the undistorted centres where axes are unknown or impossible, and NaN where
+        the lens has no inverse.
     """
-    columns, is_complete = table_of(lens).measure(roundels)
-    if not is_complete:
+    table = table_of(lens)
+    if not _core.undistort(table.coefficients, table.cell_px, added_px2, columns):
         left = np.flatnonzero(np.isnan(columns[XY.start]))
         uv, outlines = columns[UV, left].T, columns[OUTLINE, left]
         xy, scale = undistort_exactly(lens, uv, half_axes_of(outlines[:2].T, outlines[2]))
@@ -69,8 +85,8 @@ def measure(lens: Lens, roundels: Roundels) -> Array:
 
 @np.errstate(all="ignore")  # as in `centre_shifts`
 def undistort_exactly(lens: Lens, uv: Array, half_axes: Array) -> tuple[Array, Array]:
-    """Centres (2, N) and Jacobians (2, 2, N) of pixels as of `measure`, from the lens model, for ellipses with centres
-    (N, 2) and half axes (N, 2, 2), pixels."""
+    """Centres (2, N) and Jacobians (2, 2, N) of pixels as of `undistort`, from the lens model, for ellipses with
+    centres (N, 2) and half axes (N, 2, 2), pixels."""
     xy, scale = _undistort_points(lens, uv)
     known = np.flatnonzero(np.isfinite(xy[0]))
     if len(known):
@@ -92,7 +108,7 @@ def _table_of(lens: Lens) -> "UndistortionTable":
 
 
 def prepare_lenses(lenses: Iterable[Lens]) -> None:
-    """Make the tables of lenses, so that `measure` finds them; callable on any thread."""
+    """Make the tables of lenses, so that `undistort` finds them; callable on any thread."""
     for lens in lenses:
         table_of(lens)
 
@@ -114,11 +130,6 @@ class UndistortionTable:
             fitted, _ = _fit(lens, self.cell_px)
         cells = fitted.reshape(*fitted.shape[:2], 2 * len(POWERS))
         self.coefficients = np.pad(cells, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
-
-    def measure(self, r: Roundels) -> tuple[Array, bool]:
-        """See `measure`; coordinates are NaN in empty cells, and the second value is False if any are."""
-        raw = r.uv, r.cov, r.axes_px, r.angle_rad, r.id, r.id_probability, r.rotation_rad, r.rotation_sigma
-        return _core.measure(self.coefficients, self.cell_px, TOLERANCE_PX, *raw)
 
 
 def _monomials(st: Array) -> Array:

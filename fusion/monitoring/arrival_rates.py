@@ -9,7 +9,7 @@ docs/design/time_offsets.md, section 3, has the equations.
 """
 
 import math
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
@@ -99,7 +99,7 @@ class ArrivalRates:
     """The rates of the clocks of all cameras, by the arrivals of their frames."""
 
     def __init__(self) -> None:
-        self._lags: dict[str, _Lags] = {}
+        self._lags = defaultdict[str, _Lags](_Lags)
 
     def forget(self, name: str) -> None:
         """The stamps of a camera jumped."""
@@ -110,7 +110,5 @@ class ArrivalRates:
         window ended that shows it. A clock is not 1 % fast; the delay changed then."""
         if not (frame.sent_ns and frame.received_ns):  # no arrivals, or those that stamps were taken for
             return None
-        found = self._lags.setdefault(frame.camera, _Lags()).add(
-            frame.received_ns, frame.received_ns - frame.stamp_ns
-        )
+        found = self._lags[frame.camera].add(frame.received_ns, frame.received_ns - frame.stamp_ns)
         return found if found is not None and abs(found.rate) < CHANGED_SIGMA[1] else None

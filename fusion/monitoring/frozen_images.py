@@ -12,16 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Index
 from camera_node.foundation.logs import about
 from fusion.model.expected_views import ExpectedViews
 from fusion.model.frames import CalibratedFrame
 from fusion.model.observations import CameraArray, MarkerTable
 from fusion.model.states import Snapshot
+from fusion.model.undistortion import COV, UV
 
 log = logging.getLogger("fusion")
 SEEN_PX = 2.0  # between an expected and a detected roundel
+DETECTED = slice(UV.start, COV.stop)  # centres and their covariances
 MOVED_PX = 1.5  # by which a marker moved that the image still shows at its old place
 
 
@@ -64,7 +65,7 @@ class FrozenImages:
             robots_now: the robots at the last frame set; None before the first. Called if images are identical.
         """
         name, run = frame.camera, self._runs.get(frame.camera)
-        if run is None or not _are_identical(run.first.roundels, frame.roundels):
+        if run is None or not _are_identical(run.first, frame):
             if run is not None and run.is_frozen:
                 log.info("camera %s delivers new images again", name, extra=about(name))
             self._runs[name] = _Run(frame)
@@ -85,7 +86,7 @@ class FrozenImages:
         if run.rows is None or run.uv is None:
             rows = np.flatnonzero(now.tracked[self._markers.robot])
             expected = self._expected(run.first, now, rows)
-            seen = _distances(expected.uv, run.first.roundels.uv) < SEEN_PX
+            seen = _distances(expected.uv, run.first.columns[UV].T) < SEEN_PX
             run.rows, run.uv = expected.rows[seen], expected.uv[seen]
         expected = self._expected(frame, now, run.rows[now.tracked[self._markers.robot[run.rows]]])
         before = run.uv[np.isin(run.rows, expected.rows)]
@@ -98,8 +99,10 @@ class FrozenImages:
         return ExpectedViews.of(self._cameras, frame.camera, now.states, tau, (self._markers, rows))
 
 
-def _are_identical(a: Roundels, b: Roundels) -> bool:
-    return len(a) > 0 and np.array_equal(a.uv, b.uv) and np.array_equal(a.axes_px, b.axes_px)
+def _are_identical(a: CalibratedFrame, b: CalibratedFrame) -> bool:
+    """Whether there are detections, and all have the same centres and covariances."""
+    before, now = a.columns[DETECTED], b.columns[DETECTED]
+    return before.size > 0 and np.array_equal(before, now)
 
 
 def _distances(uv: Array, detected: Array) -> Array:

@@ -24,14 +24,26 @@ struct FilterSteps {
     const double* dt;
 };
 
-/// Updates the responses (B x 12 x 8 n_cameras) of the bodies to the errors of the cameras, and the parts of
-/// P that count these errors as noise (B). `camera` is that of each frame.
-void respond(const FramePoses& poses, const WeightedEquations& observed, const FilterSteps& steps,
-             const int64_t* camera, size_t n_cameras, double* responses, ErrorMatrix* counted);
+/// The columns of one camera in a response.
+using CameraBlock = std::array<std::array<double, kCameraErrors>, kErrors>;
 
-/// Writes the covariances P - counted + S L L^T S^T of B bodies with the responses S and the lower triangular
-/// factor L (d x d) of the covariance of the cameras.
-void consider(const ErrorMatrix* P, const ErrorMatrix* counted, const double* responses, const double* factor,
-              size_t n_bodies, size_t d, ErrorMatrix* to);
+/// Updates the responses of the bodies to the errors of the cameras (a block of each body and camera), and
+/// the parts of P that count these errors as noise, of each body. `camera` is that of each frame.
+void respond(const FramePoses& poses, const WeightedEquations& observed, const FilterSteps& steps,
+             const int64_t* camera, size_t n_cameras, CameraBlock* responses, ErrorMatrix* counted);
+
+/// What claims consider of a body beside its filter's P: the part that counts cameras as noise, the responses
+/// to `n_cameras` of them, its rotation, and the covariance of its own frame (rotation and position, body
+/// frame) by errors of the places of its markers.
+struct Considered {
+    const ErrorMatrix* counted;
+    const CameraBlock* responses;
+    const double *R, *frame;
+};
+
+/// Writes P - counted + S L L^T S^T + T frame T^T of B bodies, with the lower triangular factor L of the
+/// covariance of the cameras and T that turns the frame into the world.
+void consider(const ErrorMatrix* P, const Considered& bodies, const double* factor, size_t n_bodies,
+              size_t n_cameras, ErrorMatrix* to);
 
 }  // namespace roundel::fusion

@@ -33,6 +33,7 @@ from fusion.model.observations import (
     count_checked,
 )
 from fusion.model.states import Snapshot, States
+from fusion.model.undistortion import UV
 from fusion.rig_graph.hypotheses import CAUSES, FREE_SIGMA, INTERVAL_NS, RIVAL, Window
 
 HALF_NS = 100_000_000  # before and after a keyframe, for the velocities of its robots
@@ -253,7 +254,7 @@ def _match(
     Views that show their markers where the calibration expects them need no other pose: a camera that was moved in the
     meantime has some of both kinds.
     """
-    expected, detected = [view.expected for view in views], [view.frame.roundels.uv for view in views]
+    expected, detected = [view.expected for view in views], [view.frame.columns[UV].T for view in views]
     matches = [mutual_nearest(e.uv, uv, GATES_PX[-1]) for e, uv in zip(expected, detected, strict=True)]
     possible = [min(len(e.rows), len(uv)) for e, uv in zip(expected, detected, strict=True)]
     others = [k for k, most in enumerate(possible) if len(matches[k][0]) < FOUND * most]
@@ -276,7 +277,7 @@ def _assemble(
     for keyframe, matched in zip(keyframes, found, strict=True):
         frames = FrameSet(keyframe.t_ns, tuple(frame for frame, _, _ in matched))
         table = DetectionTable.of(frames, cameras)
-        first = np.cumsum([0, *(len(frame.roundels) for frame in frames.frames)])
+        first = np.cumsum([0, *(frame.columns.shape[1] for frame in frames.frames)])
         rows = np.concatenate(
             [np.empty(0, np.intp), *(at + d for at, (_, _, d) in zip(first, matched, strict=False))]
         )

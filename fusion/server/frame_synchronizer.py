@@ -4,7 +4,7 @@
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import islice, pairwise
 from statistics import median_low
 
 from fusion.model.frames import CalibratedFrame, FrameSet
@@ -139,9 +139,10 @@ class FrameSynchronizer:
 
         With most messages the number of frames that wait decides it.
         """
-        if self._end_ns is None or not self.period_ns or len(self._waiting) - n_used < worth:
+        if self._end_ns is None or not self.period_ns or (n_new := len(self._waiting) - n_used) < worth:
             return None
-        if not (n_missing := sum(1 for _ in self._missing_until(self._end_ns))):
+        n_missing = sum(1 for _ in islice(self._missing_until(self._end_ns), n_new // worth + 1))
+        if not n_missing or n_new < worth * n_missing:
             return None
         opened = self._gather(self._end_ns, self.period_ns)
         return opened if len(opened.frames) - n_used >= worth * n_missing else None

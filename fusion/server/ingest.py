@@ -47,7 +47,7 @@ def admit(
     if (refused := refusal(message, cameras)) is not None:
         return refused
     frame = CalibratedFrame.of(message, cameras[message.camera], received_ns)
-    return _with_strongest(frame) if len(frame.roundels) > MAX_DETECTIONS else frame
+    return _with_strongest(frame) if len(message) > MAX_DETECTIONS else frame
 
 
 def refusal(message: Detections, cameras: Mapping[str, Camera]) -> Refusal | None:

@@ -134,13 +134,10 @@ class Estimator:
                 headings = linearize_headings(self.cameras, _estimates(fit, states.P), with_headings)
             if not fit.step(_eliminate(*fit.linearize(headings)), small):
                 break
-        P = fit.covariances(states.P)
+        R, (p, omega, v), P, equations, weights, squared_px, cost = fit.result(states.P, seen.cov)
         if self.single.any():
             P[self.single] = reset_unobservable(P[self.single])
-        equations, weights, residuals = fit.centres()
-        squared_px = _core.squared_px(residuals, seen.cov, observations.whiten)
-        cost = fit.costs(squared_px / seen.variance_px2)
-        return BodyFit(_estimates(fit, P), squared_px, cost, equations, weights)
+        return BodyFit(States(R, p, omega, v, P), squared_px, cost, equations, weights)
 
     def with_time_errors(self, states: States, observations: MatchedObservations) -> MatchedObservations:
         """With the noise of late frames and of the clocks of the cameras."""

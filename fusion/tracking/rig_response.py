@@ -21,7 +21,7 @@ import numpy as np
 from calib.rig.camera_errors import ERRORS, covariance_factor
 from camera_node.foundation.arrays import Array, Index
 from fusion import _core
-from fusion.model.observations import MatchedObservations
+from fusion.model.observations import MarkerTable, MatchedObservations
 from fusion.model.states import States, Transition
 from fusion.tracking.estimator import Estimator
 from fusion.tracking.identification import RefinedFits
@@ -35,13 +35,13 @@ class RigResponse:
         estimator: of the robots.
 
     Attributes:
-        responses: (N, 12, 8 C) derivatives of the errors of the states by those of the cameras.
+        responses: (N, C, 12, 8) derivatives of the errors of the states by those of each camera.
         counted: (N, 12, 12) parts of the filter's covariances that count the errors of cameras as noise.
     """
 
     def __init__(self, estimator: Estimator) -> None:
         self._cameras, n = estimator.cameras, len(estimator.single)
-        self.responses = np.zeros((n, 12, ERRORS * len(self._cameras.names)))
+        self.responses = np.zeros((n, len(self._cameras.names), 12, ERRORS))
         self.counted = np.zeros((n, 12, 12))
         self._factor, self._factor_of = np.zeros((0, 0)), (-1, 0.0)
 
@@ -85,10 +85,9 @@ class RigResponse:
         the predictions and the transition to them; robots without observations are predicted."""
         seen, (information, motion) = observations.detections, predicted
         rig_px2 = self._cameras.error_px[seen.camera] ** 2 + added_px2
-        self.responses, self.counted = _core.respond(
+        _core.respond(
             self._cameras.frame_poses(states, seen.exposures),
             seen.exposures.camera,
-            len(self._cameras.names),
             *linearized,
             rig_px2 / seen.variance_px2,
             seen.frame,
@@ -103,14 +102,17 @@ class RigResponse:
             self.counted,
         )
 
-    def claimed(self, P: Array, added_px2: float = 0.0) -> Array:
-        """(N, 12, 12) covariances of the robots that contain the errors of the cameras.
+    def claimed(self, states: States, markers: MarkerTable, added_px2: float = 0.0) -> Array:
+        """(N, 12, 12) covariances of the robots that contain the errors of the cameras, and of the places of markers on
+        their robots.
 
         Args:
-            P: (N, 12, 12) the filter's.
+            states: of the robots.
+            markers: of the robots.
             added_px2: variance that the detections of a camera may have in common beside the calibration's error.
         """
-        return _core.consider(P, self.counted, self.responses, self._factor_with(added_px2))
+        factor = self._factor_with(added_px2)
+        return _core.consider(states.P, self.counted, self.responses, factor, states.R, markers.frame)
 
     def _factor_with(self, added_px2: float) -> Array:
         """(8 C, 8 C) lower triangular factor of the covariance of the cameras, each turned by `added_px2` besides."""
@@ -119,5 +121,6 @@ class RigResponse:
             covariance = self._cameras.covariance.copy()
             turns = np.flatnonzero(np.arange(len(covariance)) % ERRORS < 2)
             covariance[turns, turns] += added_px2 / self._cameras.focal[turns // ERRORS] ** 2
-            self._factor, self._factor_of = covariance_factor(covariance), key
+            factor = covariance_factor(covariance)
+            self._factor, self._factor_of = np.ascontiguousarray(factor), key
         return self._factor

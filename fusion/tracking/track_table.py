@@ -103,12 +103,6 @@ class TrackTable:
             self.markers.place(row, used.T, old.markers.frame[k])
         return same
 
-    def claim(self, covariance: Array) -> None:
-        """Claim covariances (N, 12, 12) of the states and the errors of the places of markers on their robots."""
-        turned = np.zeros((len(covariance), 12, 6))
-        turned[:, THETA, :3], turned[:, POSITION, 3:] = np.eye(3), self.states.R
-        self.claimed = covariance + turned @ self.markers.frame @ turned.transpose(0, 2, 1)
-
     def interval_s(self, t_ns: int) -> float:
         """The prediction interval from the last frame set to `t_ns`."""
         dt = START_S if self.t_ns is None else max((t_ns - self.t_ns) * 1e-9, START_S)

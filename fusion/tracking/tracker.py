@@ -202,7 +202,7 @@ class Tracker:
         same = other.table.inherit(self.table, renamed)
         other.monitors.inherit(self.monitors, same)
         other.rig_response.inherit(self.rig_response, same)
-        other.table.claim(other.rig_response.claimed(other.table.states.P))
+        other.table.claimed = other.rig_response.claimed(other.table.states, other.table.markers)
         return other
 
     def restarted(self) -> "Tracker":
@@ -245,7 +245,8 @@ class Tracker:
 
     def _claim(self) -> None:
         """State the covariances of the robots with the errors of the cameras."""
-        self.table.claim(self.rig_response.claimed(self.table.states.P, self.robust.added_px2))
+        table = self.table
+        table.claimed = self.rig_response.claimed(table.states, table.markers, self.robust.added_px2)
 
     def _misses_bodies(self, tracked: Mask) -> bool:
         """Whether a constellation is missing, whose acquisition can displace a single-marker robot."""

@@ -2,6 +2,7 @@
 #include <nanobind/stl/tuple.h>
 
 #include <algorithm>
+#include <cstring>
 
 #include "arrays.hpp"
 #include "assignment.hpp"
@@ -158,39 +159,59 @@ void forget_impossible(double* outlines, size_t n) {
     }
 }
 
-/// The columns of a detection table (19, N), without delays, of N roundels, and whether their cells have all
-/// of them: impossible outlines are NaN. A number without a probability comes from a file and is no code.
-auto measure(const In<double, -1, -1, 20>& cells, double cell_px, double error_px,
-             const In<double, -1, 2>& uv, const In<double, -1, 2, 2>& cov, const In<double, -1, 2>& axes,
-             const Numbers& angle, const In<int32_t, -1>& id, const Numbers& probability,
-             const Numbers& rotation, const Numbers& sigma) {
+/// Writes these numbers of all rows of a column of a message, one after another; bytes have no alignment.
+template <class From>
+double* append(double* to, const nb::bytes& column, size_t n, size_t width,
+               std::initializer_list<size_t> order) {
+    if (column.size() != n * width * sizeof(From)) throw nb::value_error("columns of different lengths");
+    for (const size_t i : order)
+        for (size_t k = 0; k < n; ++k) {
+            From value;
+            const size_t at = (k * width + i) * sizeof(From);
+            std::memcpy(&value, static_cast<const char*>(column.c_str()) + at, sizeof(From));
+            *to++ = double(value);
+        }
+    return to;
+}
+
+/// The columns of a detection table (19, N) of the columns of a message, before `undistort`. A number without
+/// a probability comes from a file and is no code.
+Out detection_columns(const nb::bytes& uv, const nb::bytes& cov, const nb::bytes& axes,
+                      const nb::bytes& angle, const nb::bytes& id, const nb::bytes& probability,
+                      const nb::bytes& rotation, const nb::bytes& sigma) {
+    const size_t n = uv.size() / (2 * sizeof(double));
+    auto [all, to] = make({19, n});
+    const auto append_known = [n](double* at, const nb::bytes& column) {
+        return column.size() ? append<float>(at, column, n, 1, {0})
+                             : std::fill_n(at, n, std::numeric_limits<double>::quiet_NaN());
+    };
+    to = append<double>(to, uv, n, 2, {0, 1});
+    to = append<float>(to, cov, n, 3, {0, 1, 1, 2});
+    to = append<float>(to, axes, n, 2, {0, 1});
+    to = append<float>(to, angle, n, 1, {0});
+    append_known(to, probability);
+    double* const code = to + 6 * n;
+    append<int32_t>(code, id, n, 1, {0});
+    for (size_t k = 0; k < n; ++k)
+        if (!std::isfinite(to[k])) code[k] = -1;
+    to = append_known(append_known(code + n, rotation), sigma);
+    std::fill_n(to, n, 0.0);
+    return all;
+}
+
+/// Writes the undistorted coordinates and the scale of the columns of a detection table (19, N), NaN in place
+/// of impossible outlines, and adds a variance to the centres. Returns whether the cells have all roundels.
+bool undistort(const In<double, -1, -1, 20>& cells, double cell_px, double added_px2,
+               nb::ndarray<double, nb::shape<19, -1>, nb::c_contig, nb::device::cpu> table) {
     if (cells.shape(0) < 3 || cells.shape(1) < 3) throw nb::value_error("a table without cells");
     const InverseLens lens{cells.data(), int64_t(cells.shape(1)) - 2, int64_t(cells.shape(0)) - 2, cell_px};
-    const size_t n = uv.shape(0);
-    require_equal(n, {cov.shape(0), axes.shape(0), angle.size(), id.size(), probability.size(),
-                      rotation.size(), sigma.size()});
-    auto [all, to] = make({19, n});
-    const auto transpose = [n, &to = to](const double* from, size_t width) {
-        for (size_t column = 0; column < width; ++column)
-            for (size_t k = 0; k < n; ++k) *to++ = from[k * width + column];
-    };
-    const Columns<2> centres{to, n};
-    transpose(uv.data(), 2);
-    transpose(cov.data(), 4);
-    for (double* const variance : {to - 4 * n, to - n})
-        for (size_t k = 0; k < n; ++k) variance[k] += error_px * error_px;
-    double* const outlines = to;
-    transpose(axes.data(), 2);
-    transpose(angle.data(), 1);
-    forget_impossible(outlines, n);
-    look_up(lens, {centres, {outlines, n}, outlines + 2 * n}, to, to + 2 * n);
-    const bool is_complete = std::none_of(to, to + n, [](double x) { return std::isnan(x); });
-    to += 6 * n;
-    for (size_t k = 0; k < n; ++k) *to++ = std::isfinite(probability(k)) ? id(k) : -1;
-    transpose(rotation.data(), 1);
-    transpose(sigma.data(), 1);
-    std::fill_n(to, n, 0.0);
-    return std::make_tuple(all, is_complete);
+    const size_t n = table.shape(1);
+    double *const uv = table.data(), *const cov = uv + 2 * n, *const axes = cov + 4 * n, *xy = axes + 3 * n;
+    for (double* const variance : {cov, cov + 3 * n})
+        for (size_t k = 0; k < n; ++k) variance[k] += added_px2;
+    forget_impossible(axes, n);
+    look_up(lens, {{uv, n}, {axes, n}, axes + 2 * n}, xy, xy + 2 * n);
+    return std::none_of(xy, xy + n, [](double x) { return std::isnan(x); });
 }
 
 }  // namespace
@@ -207,7 +228,9 @@ void bind_detections(nb::module_& m) {
     m.def("marker_states", &marker_states);
     m.def("assign", &assigned);
     m.def("labelings", &labelings);
-    m.def("measure", &measure);
+    m.def("detection_columns", &detection_columns);
+    m.def("undistort", &undistort, nb::arg("cells"), nb::arg("cell_px"), nb::arg("added_px2"),
+          nb::arg("columns").noconvert());
 }
 
 }  // namespace roundel::fusion

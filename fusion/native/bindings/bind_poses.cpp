@@ -116,6 +116,17 @@ Out shears_of(const Pairs& axes, const Numbers& angle, const Vectors& centre, co
     return both;
 }
 
+/// (N,) squared lengths in pixels of N whitened errors, whose covariances are `cov`; NaN where `whiten` is.
+std::pair<Out, double*> squared_lengths(const double* errors, Columns<4> cov, Columns<4> whiten) {
+    auto [squares, to] = make({cov.n});
+    for (size_t k = 0; k < cov.n; ++k) {  // errors = L^-1 pixels, where L L^T is the covariance
+        const CovarianceFactor L(cov, k);
+        const double u = L.a * errors[2 * k], v = L.b * errors[2 * k] + L.c * errors[2 * k + 1];
+        to[k] = std::isfinite(whiten.at(0, k)) ? u * u + v * v : std::numeric_limits<double>::quiet_NaN();
+    }
+    return {squares, to};
+}
+
 /// `BodyFit` with the arrays that it reads.
 class ArrayFit {
   public:
@@ -150,26 +161,25 @@ class ArrayFit {
         }
         return std::make_tuple(R, vectors);
     }
-    Out covariances(const Covariances& P) const {
-        require_equal(fit_.estimates().size(), {P.shape(0)});
-        auto [fitted, to] = make({P.shape(0), kErrors, kErrors});
-        std::copy_n(P.data(), P.size(), to);
-        fit_.write_covariances(reinterpret_cast<ErrorMatrix*>(to));
-        return fitted;
-    }
-    Out costs(const Numbers& squared) const {
-        require_equal(discs_.frame.size(), {squared.size()});
-        auto [costs, to] = make({fit_.estimates().size()});
-        fit_.write_costs(squared.data(), to);
-        return costs;
-    }
-    /// Of the centres: equations, weights and residuals.
-    auto centres() const {
-        const size_t n = discs_.frame.size();
-        auto [weights, to] = make({n});
-        std::copy_n(fit_.weights().data(), n, to);
-        return std::make_tuple(copied(fit_.equations(), {n, 2, kErrors + 1}), weights,
-                               copied(fit_.residuals(), {n, 2}));
+    /// The estimates, then their covariances, of the centres the equations, weights and squared residuals,
+    /// and the costs of the bodies. `P` has the covariances of bodies without observations.
+    auto result(const Covariances& P, const Matrices2& cov) const {
+        const size_t n = discs_.frame.size(), n_bodies = fit_.estimates().size();
+        require_equal(n_bodies, {P.shape(0)});
+        const auto [R, vectors] = estimates();
+        auto [fitted, to_fitted] = make({n_bodies, kErrors, kErrors});
+        auto [weights, to_weight] = make({n});
+        auto [costs, to_cost] = make({n_bodies});
+        std::copy_n(P.data(), P.size(), to_fitted);
+        fit_.write_covariances(reinterpret_cast<ErrorMatrix*>(to_fitted));
+        std::copy_n(fit_.weights().data(), n, to_weight);
+        const auto [squares, square] = squared_lengths(fit_.residuals()[0].data(), columns<4>(cov, n),
+                                                       columns<4>(std::get<1>(columns_), n));
+        std::vector<double> squared(n);
+        for (size_t k = 0; k < n; ++k) squared[k] = square[k] / ((cov(0, 0, k) + cov(1, 1, k)) / 2);
+        fit_.write_costs(squared.data(), to_cost);
+        return std::make_tuple(R, vectors, fitted, copied(fit_.equations(), {n, 2, kErrors + 1}), weights,
+                               squares, costs);
     }
 
   private:
@@ -213,30 +223,24 @@ Out whiten(const Matrices2& cov, const Matrices2& scale) {
     return whitened;
 }
 
-/// (N,) squared lengths in pixels of N whitened errors, whose covariances are `cov`; NaN where `whiten` is.
 Out squared_px(const In<double, -1, 2>& errors, const Matrices2& cov, const Matrices2& whiten) {
     const size_t n = errors.shape(0);
-    const auto P = columns<4>(cov, n), scales = columns<4>(whiten, n);
-    auto [squares, to] = make({n});
-    for (size_t k = 0; k < n; ++k) {  // errors = L^-1 pixels, where L L^T is the covariance
-        const CovarianceFactor L(P, k);
-        const double u = L.a * errors(k, 0), v = L.b * errors(k, 0) + L.c * errors(k, 1);
-        to[k] = std::isfinite(scales.at(0, k)) ? u * u + v * v : std::numeric_limits<double>::quiet_NaN();
-    }
-    return squares;
+    return squared_lengths(errors.data(), columns<4>(cov, n), columns<4>(whiten, n)).first;
 }
 
-auto respond_arrays(const FramePoses& poses, const Index& camera, size_t n_cameras,
-                    const EquationArray& equations, const Numbers& weights, const Numbers& rig_share,
-                    const Index& frame, const Index& body, const Pairs& xy, const Matrices2& whiten,
-                    const Covariances& information, const Covariances& P, const Rotations& T,
-                    const Numbers& dt, const In<double, -1, 12, -1>& responses, const Covariances& counted) {
-    const size_t n = body.size(), n_bodies = poses.n_bodies(), d = kCameraErrors * n_cameras;
+template <nb::ssize_t... shape>
+using InOut = nb::ndarray<double, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
+
+void respond_arrays(const FramePoses& poses, const Index& camera, const EquationArray& equations,
+                    const Numbers& weights, const Numbers& rig_share, const Index& frame, const Index& body,
+                    const Pairs& xy, const Matrices2& whiten, const Covariances& information,
+                    const Covariances& P, const Rotations& T, const Numbers& dt,
+                    const InOut<-1, -1, 12, 8>& responses, const InOut<-1, 12, 12>& counted) {
+    const size_t n = body.size(), n_bodies = poses.n_bodies(), n_cameras = responses.shape(1);
     require_equal(n, {equations.shape(0), weights.size(), rig_share.size(), frame.size()});
     require_equal(n_bodies, {information.shape(0), P.shape(0), T.shape(0), dt.size(), responses.shape(0),
                              counted.shape(0)});
     require_equal(poses.exposures().size(), {camera.size()});
-    require_equal(d, {responses.shape(2)});
     below(poses.exposures().size(), frame);
     below(n_cameras, camera);
     const WeightedEquations observed{
@@ -248,25 +252,24 @@ auto respond_arrays(const FramePoses& poses, const Index& camera, size_t n_camer
         columns<4>(whiten, n)};
     const FilterSteps steps{reinterpret_cast<const ErrorMatrix*>(information.data()),
                             reinterpret_cast<const ErrorMatrix*>(P.data()), T.data(), dt.data()};
-    auto [S, to_S] = make({n_bodies, kErrors, d});
-    auto [D, to_D] = make({n_bodies, kErrors, kErrors});
-    std::copy_n(responses.data(), responses.size(), to_S);
-    std::copy_n(counted.data(), counted.size(), to_D);
-    unlocked([&, to_S = to_S, to_D = to_D] {
-        respond(poses, observed, steps, camera.data(), n_cameras, to_S, reinterpret_cast<ErrorMatrix*>(to_D));
+    unlocked([&] {
+        respond(poses, observed, steps, camera.data(), n_cameras,
+                reinterpret_cast<CameraBlock*>(responses.data()),
+                reinterpret_cast<ErrorMatrix*>(counted.data()));
     });
-    return std::make_tuple(S, D);
 }
 
-Out consider_arrays(const Covariances& P, const Covariances& counted, const In<double, -1, 12, -1>& responses,
-                    const In<double, -1, -1>& factor) {
+Out consider_arrays(const Covariances& P, const Covariances& counted,
+                    const In<double, -1, -1, 12, 8>& responses, const In<double, -1, -1>& factor,
+                    const Rotations& R, const In<double, -1, 6, 6>& frame) {
     const size_t n = P.shape(0), d = factor.shape(0);
-    require_equal(n, {counted.shape(0), responses.shape(0)});
-    require_equal(d, {factor.shape(1), responses.shape(2), d / kCameraErrors * kCameraErrors});
+    require_equal(n, {counted.shape(0), responses.shape(0), R.shape(0), frame.shape(0)});
+    require_equal(d, {factor.shape(1), kCameraErrors * responses.shape(1)});
     auto [claimed, to] = make({n, kErrors, kErrors});
+    const Considered bodies{reinterpret_cast<const ErrorMatrix*>(counted.data()),
+                            reinterpret_cast<const CameraBlock*>(responses.data()), R.data(), frame.data()};
     unlocked([&, to = to] {
-        consider(reinterpret_cast<const ErrorMatrix*>(P.data()),
-                 reinterpret_cast<const ErrorMatrix*>(counted.data()), responses.data(), factor.data(), n, d,
+        consider(reinterpret_cast<const ErrorMatrix*>(P.data()), bodies, factor.data(), n, responses.shape(1),
                  reinterpret_cast<ErrorMatrix*>(to));
     });
     return claimed;
@@ -293,13 +296,14 @@ void bind_poses(nb::module_& m) {
         .def("linearize", &ArrayFit::linearize)
         .def("step", &ArrayFit::step)
         .def("estimates", &ArrayFit::estimates)
-        .def("covariances", &ArrayFit::covariances)
-        .def("costs", &ArrayFit::costs)
-        .def("centres", &ArrayFit::centres);
+        .def("result", &ArrayFit::result);
     m.def("whiten", &whiten);
     m.def("squared_px", &squared_px);
     m.def("shears", &shears_of);
-    m.def("respond", &respond_arrays);
+    m.def("respond", &respond_arrays, nb::arg("poses"), nb::arg("camera"), nb::arg("equations"),
+          nb::arg("weights"), nb::arg("rig_share"), nb::arg("frame"), nb::arg("body"), nb::arg("xy"),
+          nb::arg("whiten"), nb::arg("information"), nb::arg("P"), nb::arg("T"), nb::arg("dt"),
+          nb::arg("responses").noconvert(), nb::arg("counted").noconvert());
     m.def("consider", &consider_arrays);
 }
 

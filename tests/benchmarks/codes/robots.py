@@ -74,7 +74,7 @@ def crossing_robots(seconds: float, seed: int = 1) -> tuple[str, ...]:
     )
     tracker, synchronizer = Tracker(arena.cameras, robots), FrameSynchronizer(PERIOD_NS)
     for frame in arena.frames(round(seconds * 1e9 / PERIOD_NS)):
-        synchronizer.add(replace(frame, roundels=_partly_read(frame.roundels, rng)))
+        synchronizer.add(replace(frame, detected=_partly_read(frame.roundels, rng)))
     shown = tracked = wrong = late = 0
     since = np.full(ROBOTS, np.inf)
     for frame_set in synchronizer.finish():

@@ -88,6 +88,7 @@ def test_a_fit_is_reweighted_least_squares_of_the_bodies_that_still_move():
     xy = np.nan_to_num(ARRAY.views(states, exposures, discs).xy) + 2e-3 * random.normal(size=(2, n))
     xy[:, :9] += 0.1  # outliers
     whiten, sigma, single = np.tile(500 * np.eye(2)[..., None], n), np.full(n, 0.2), np.zeros(BODIES, bool)
+    xy[:, -1], whiten[..., -1], cov = np.nan, np.nan, np.tile(4 * np.eye(2)[..., None], n)
     shaped, turned = random.random((2, n)) < [[0.5], [0.1]]
     shape = seen.detections.axes_px, seen.detections.angle_rad, seen.detections.scale, sigma
     prior, headings = np.tile(3 * np.eye(12), (BODIES, 1, 1)), random.normal(size=(turned.sum(), 2, 13))
@@ -113,17 +114,17 @@ def test_a_fit_is_reweighted_least_squares_of_the_bodies_that_still_move():
         delta[moving] += step
         errors = centres[:, :, 12] - np.einsum("nai,ni->na", centres[:, :, :12], steps[discs.body])
         rest[mine[:n]] = errors[mine[:n]]
-        assert_near(fit.centres()[1], weights[:n])
-        assert_near(fit.centres()[2], rest, atol=1e-9 * np.abs(rest).max())
-        R, (p, omega, v) = fit.estimates()
+        R, (p, omega, v), P, _, used, squared, costs = fit.result(states.P, cov)
+        assert_near(used, weights[:n])
+        lengths = np.append(4 * (rest[:-1] ** 2).sum(1), np.nan)
+        assert_near(squared, lengths, atol=1e-9 * np.nanmax(lengths))
         estimates = States(R, p, omega, v, states.P)
         assert_near(estimates.minus(states.retract(delta)), np.zeros((BODIES, 12)))
         moving = moving[moving != 2]
-    assert_near(fit.covariances(states.P)[moving], np.linalg.inv(H)[moving])
-    squared = np.append(random.uniform(0, 200, n - 1), np.nan)
-    observed = 16 * np.log1p(np.where(squared < 100, squared, 100) / 16)
+    assert_near(P[moving], np.linalg.inv(H)[moving])
+    observed = 16 * np.log1p(np.where(squared < 400, squared / 4, 100) / 16)
     moved = np.einsum("bi,bij,bj->b", delta, prior, delta)
-    assert_near(fit.costs(squared), np.bincount(discs.body, observed, BODIES) + moved)
+    assert_near(costs, np.bincount(discs.body, observed, BODIES) + moved)
 
 
 def test_whitened_errors_are_distances_in_pixels():

@@ -3,7 +3,6 @@
 
 import contextlib
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +41,12 @@ OUTLINES = np.ones((2, N)), np.zeros(N), SCALES, np.ones(N)
 def of_discs(method: Callable[..., np.ndarray], *rest: np.ndarray) -> tuple[Callable[..., np.ndarray], tuple]:
     """A method whose first argument is given by the arrays of the discs."""
     return lambda *given: method(_core.DiscColumns(*given[:6]), *given[6:]), (*DISC_ARRAYS, *rest)
+
+
+def undistorted(cells: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """The columns that `undistort` writes in place; arrays with another layout are refused."""
+    _core.undistort(cells, 32.0, 1e-3, columns)
+    return columns
 
 
 CALLS = {
@@ -109,18 +114,11 @@ CALLS = {
         ),
         (VIEWPOINTS, FRAME, np.ones((N, 3)), np.ones(N), np.zeros(N), np.ones((N, 1, 2))),
     ),
-    "measure": (
-        partial(_core.measure, np.zeros((4, 5, 20)), 32.0, 1e-3),
-        (
-            *(np.ones(shape) for shape in ((N, 2), (N, 2, 2), (N, 2), N)),
-            np.zeros(N, np.int32),
-            *(np.zeros(N) for _ in range(3)),
-        ),
-    ),
+    "undistort": (lambda cells: undistorted(cells, np.ones((19, N))), (np.zeros((4, 5, 20)),)),
 }
 # Constructors check the indices only where they know what the indices refer to; `are_own` only compares cameras.
 UNCHECKED = {"DiscColumns", "DetectionColumns", "are_own"}
-ANY_LENGTH = {"inverses", "Viewpoints"}  # functions of arrays whose lengths are independent
+ANY_LENGTH = {"inverses", "Viewpoints", "undistort"}  # functions of arrays whose lengths are independent
 
 
 def alike(array: np.ndarray):
@@ -160,6 +158,24 @@ def test_arrays_of_wrong_shape_or_length_are_refused(name: str):
             short = np.ascontiguousarray(np.delete(array, -1, axis))
             with pytest.raises((TypeError, ValueError, IndexError)):
                 function(*given[:k], short, *given[k + 1 :])
+
+
+def test_an_array_that_would_be_copied_is_not_written():
+    """What the core writes in place would be lost."""
+    for array in (*alike(np.ones((19, N))), np.ones((18, N)), None):
+        with pytest.raises(TypeError):
+            undistorted(np.zeros((4, 5, 20)), array)
+
+
+@pytest.mark.parametrize("length", [0, 1, 23, 25])
+def test_columns_of_a_message_of_different_lengths_are_refused(length: int):
+    columns = [bytes(n) for n in (32, 24, 16, 8, 8, 8, 8, 8)]
+    assert _core.detection_columns(*columns).shape == (19, 2)
+    for k in range(1, len(columns)):
+        if k > 4 and length == 0:  # no codes
+            continue
+        with pytest.raises(ValueError, match="lengths"):
+            _core.detection_columns(*columns[:k], bytes(length), *columns[k + 1 :])
 
 
 @pytest.mark.parametrize("name", sorted(CALLS.keys() - UNCHECKED))
