@@ -43,6 +43,7 @@ void make_expected(ExpectedMarkers* self, const Rotations& R, const Covariances&
     below(R.shape(0), body);
     const auto positions = columns<3>(position, n), normals = columns<3>(normal, n);
     std::vector<ExpectedMarker> markers;
+    markers.reserve(n);
     for (size_t k = 0; k < n; ++k)
         markers.push_back(ExpectedMarker::of(body(k), code(k),
                                              {positions.vector(k), normals.vector(k), radius(k)},

@@ -28,6 +28,7 @@ void make_bodies(BodyStates* self, const Rotations& R, const Positions& p, const
                  const Positions& v) {
     require_equal(R.shape(0), {p.shape(0), omega.shape(0), v.shape(0)});
     BodyStates bodies;
+    bodies.reserve(R.shape(0));
     for (size_t b = 0; b < R.shape(0); ++b)
         bodies.push_back({matrix_at(R.data() + 9 * b), vector_at(p.data() + 3 * b),
                           vector_at(omega.data() + 3 * b), vector_at(v.data() + 3 * b)});
@@ -38,6 +39,7 @@ void make_exposures(CameraExposures* self, const Rotations& R_cam_world, const P
                     const Numbers& tau, const Numbers& tau_sigma) {
     require_equal(tau.size(), {R_cam_world.shape(0), centres.shape(0), tau_sigma.size()});
     CameraExposures exposures;
+    exposures.reserve(tau.size());
     for (size_t f = 0; f < tau.size(); ++f)
         exposures.push_back(
             {matrix_at(R_cam_world.data() + 9 * f), vector_at(centres.data() + 3 * f), tau(f), tau_sigma(f)});
