@@ -13,8 +13,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
-from operator import sub
+from itertools import accumulate, pairwise
 from statistics import linear_regression, median
 
 HISTORY, LEARNED = 64, 16  # frames of a camera, and how many of them define what is usual
@@ -55,7 +54,7 @@ class StampCheck:
         lag, jump = received_ns - t_ns, None
         if len(self._lags) >= LEARNED:
             stamps = sorted(self._stamps)
-            steps = list(map(sub, stamps[1:], stamps))
+            steps = [after - before for before, after in pairwise(stamps)]
             interval = _interval(steps)
             self.sigma_ns = _irregularity(steps, interval)
             jump = self._jump(t_ns, lag, least_lag_ns, steps, interval)

@@ -4,8 +4,7 @@
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import islice
-from operator import sub
+from itertools import islice, pairwise
 from statistics import median_low
 
 from fusion.model.frames import CalibratedFrame, FrameSet
@@ -38,7 +37,7 @@ class _CameraRate:
         if self.times and t_ns - self.times[-1] > MAX_GAP_NS:
             self.times.clear()
         self.times.append(t_ns)
-        steps = sorted(map(sub, islice(self.times, 1, None), self.times))
+        steps = sorted(b - a for a, b in pairwise(self.times))
         self.interval_ns = steps[(len(steps) - 1) // 2] if len(steps) > 1 else 0  # one step may be a pause
 
     def add_lag(self, lag_ns: int) -> None:
