@@ -28,6 +28,12 @@ constexpr double kNoiseSpan = 9.5;
 
 }  // namespace
 
+/// Whether the edge of a shadow lies across a roundel, so that others may be crossed, too.
+static bool shows_shadow(const std::vector<TrackedFit>& found) {
+    return std::any_of(found.begin(), found.end(),
+                       [](const TrackedFit& roundel) { return roundel.fit.shadowed; });
+}
+
 Detector::Detector(RoundelLimits limits, double search_share, bool by_paper)
     : limits_(std::move(limits)),
       search_share_(search_share),
@@ -65,6 +71,13 @@ FrameResult Detector::detect(const ImageView& image) {
         if (n_frames_ == 2 && !camera_.exponent() && search_share_ >= 1)
             find_candidates(frame, {{0, 0, image.width, image.height}}, kPriorExponent, candidates);
         n_postponed_ = fit_seeds(candidates.seeds, frame);
+        // Between ink in full light and paper in shade lies the middle of the logarithm of light, the limit
+        // of the exponent 0. The middle of light itself may make that paper dark.
+        if (n_frames_ == 1 && search_share_ >= 1 && !n_postponed_ && shows_shadow(frame.found)) {
+            Candidates in_shade;
+            find_candidates(frame, {{0, 0, image.width, image.height}}, 0, in_shade);
+            n_postponed_ = fit_seeds(in_shade.seeds, frame);
+        }
     }
     // 4. Roundels that moved during the exposure.
     fit_moving_tracked(lost, frame);

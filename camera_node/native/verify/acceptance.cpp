@@ -271,6 +271,7 @@ static std::optional<RoundelFit> fit_shadowed(const ImageView& image, InitialGue
         if (!tested.accepted || !(known || is_certain_roundel(even_light.view(), *fit, lit, even.noise)))
             return std::nullopt;
         tested.fit.unoccluded = false;  // in the image as it is
+        tested.fit.shadowed = true;
         claim_misfit(tested.fit, even.noise);
         return even_light.in_image(tested.fit);
     }

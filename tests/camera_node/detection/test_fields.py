@@ -67,14 +67,17 @@ def test_uneven_light_is_within_the_claims(what):
 @pytest.mark.parametrize(
     ("show", "share", "pictures"),
     [
-        (First(NOISE, soft_shadow).show, 0.9, 2),
-        (First(NOISE, partial(soft_shadow, penumbra=0.02)).show, 0.65, 2),
+        (First(NOISE, soft_shadow).show, 0.95, 2),
+        (First(NOISE, partial(soft_shadow, penumbra=0.02)).show, 0.85, 2),
         pytest.param(Second(light="shadow").show, 0.85, 1, marks=pytest.mark.ci),
     ],
     ids=["soft", "hard", "second generator"],
 )
 def test_one_picture_shows_the_edges_of_shadows(show, share, pictures):
-    """Without their light as a hypothesis 82, 62 and 70 % are found, with up to 3 times the claimed variance."""
+    """Without their light as a hypothesis 82, 62 and 70 % are found, with up to 3 times the claimed variance.
+
+    Without the search by the middle of the logarithm 77 % of those under hard edges are found.
+    """
     measured = measure_cell(Detector(), show, BAND, pictures)
     assert measured.found > share
     assert 0.25 < measured.centre < CLAIM
