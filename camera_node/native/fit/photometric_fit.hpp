@@ -109,10 +109,10 @@ struct RoundelFit {
     Shading shading{};
     bool clipped = false;      // the paper is brighter than the camera can show
     bool provisional = false;  // accepted if the camera's tone curve and processing explain it
-    bool shadowed = false;     // the edge of a shadow lay across the roundel, and was taken out of its picture
-    bool uneven = false;       // the residuals show light that changes by more than the fit contains
-    double correlation = 1;    // of the residuals along the edges (`EdgeMisfit::correlation`)
-    Fields fields{};           // that the fit contains, in the image's frame
+    bool shadowed = false;   // the edge of a shadow lay across the roundel, and was taken out of its picture
+    bool uneven = false;     // the residuals show light that changes by more than the fit contains
+    double correlation = 1;  // of the residuals along the edges (`EdgeMisfit::correlation`)
+    Fields fields{};         // that the fit contains, in the image's frame
     Bend bend{};
     double contrast() const { return bright - dark; }
     /// A level from ink (0) to paper (1) as the picture shows it, which ends at 255.
