@@ -48,7 +48,7 @@ from fusion.rig_graph.keyframes import GATES_PX
 MEMORY_S = 60.0
 FIRST_S = 1.0  # before the first window: mounts walked, so that no pose is exact
 # By which the rotation of a camera is another one after a minute, rad: from a mount that windows can't tell from one at
-# rest, to one that turns by half a degree in three minutes.
+# rest, to one that turns by half a degree in an hour, and more if it goes on in one direction.
 RATES = np.array([3e-5, 1e-4, 3e-4, 1e-3]) / 60**0.5
 ARM_M = 1.0  # from a camera to the point about which its mount turns: the foot of a tripod, the end of a bar
 OF_POSE = np.arange(ERRORS) < POSITION.stop
