@@ -18,7 +18,6 @@ from calib.rig.camera import Camera
 from calib.rig.camera_errors import (
     ERRORS,
     OF_IMAGE,
-    POSITION,
     USUAL_PX,
     error_covariance,
     errors_of_motion,
@@ -51,7 +50,9 @@ FIRST_S = 1.0  # before the first window: mounts walked, so that no pose is exac
 # rest, to one that turns by half a degree in an hour, and more if it goes on in one direction.
 RATES = np.array([3e-5, 1e-4, 3e-4, 1e-3]) / 60**0.5
 ARM_M = 1.0  # from a camera to the point about which its mount turns: the foot of a tripod, the end of a bar
-OF_POSE = np.arange(ERRORS) < POSITION.stop
+OF_MOUNT = np.array(
+    [1.0] * 3 + [ARM_M] * 3 + [0.0] * 2
+)  # how far each error of a camera walks, by its rotation
 
 
 class Refinement:
@@ -71,19 +72,19 @@ class Refinement:
         self._metrics = image_metrics(given)
         self._stated, self._since, self._scale = error_covariance(given), np.diag(since), 1.0
         self._own = _own_covariance(given, self._metrics)
-        self.relative = _relative_to_all(given, self._metrics)
-        self._is_of_pose = np.tile(OF_POSE, len(given))
-        self._is_of_lens = np.tile(OF_IMAGE & ~OF_POSE, len(given))
-        self._walk = np.square(RATES)[:, None] * np.tile([1.0] * 3 + [ARM_M**2] * 3 + [0.0] * 2, len(given))
+        self._together = errors_of_motion(np.array([camera.matrix() for camera in given]))
+        self.relative = _relative_to_all(self._together, self._metrics)
+        self._of_mounts = np.tile(OF_MOUNT, len(given))
+        self._is_of_lens = np.tile(OF_IMAGE & (OF_MOUNT == 0), len(given))
         self._corrected = np.zeros(len(since))  # of poses, and of lenses that are the calibrated ones
+        self._t_ns, self._n_windows = 0, 0.0  # that count
         self._forget()
-        self._t_ns = self._n_refused = 0
-        self._n_windows = 0.0  # that count
-        self._freed = set[int]()  # cameras that changed, and are not corrected yet
-        self._other_lenses = set[int]()  # the same of lenses
 
     def _forget(self) -> None:
         """Windows showed nothing: of each rate, estimates, covariances and the logarithm of its likelihood."""
+        self._n_refused = 0
+        self._freed = set[int]()  # cameras that changed, and are not corrected yet
+        self._other_lenses = set[int]()  # the same of lenses
         self._x = np.zeros((len(RATES), len(self._since)))
         self._P = np.tile(self._prior, (len(RATES), 1, 1))
         self._evidence = np.zeros(len(RATES))
@@ -140,10 +141,7 @@ class Refinement:
         if not self._agrees(H, y - H @ self.x):
             self._n_refused += 1
             if self._n_refused >= CONFIRMED:
-                self._n_refused = 0
                 self._forget()
-                self._freed.clear()
-                self._other_lenses.clear()
             return
         self._n_refused = 0
         self._add(H, y)
@@ -165,11 +163,12 @@ class Refinement:
         those in use."""
         decay = np.exp(-dt / MEMORY_S)
         self._n_windows = 1 + decay**2 * self._n_windows
-        kept = np.where(self._is_of_pose, 1.0, decay)
-        widened = dt * self._walk + (1 - kept**2) * np.diag(self._prior)
+        decays = np.where(self._of_mounts > 0, 1.0, decay)
+        walked = dt * np.square(np.outer(RATES, self._of_mounts))
+        widened = walked + (1 - decays**2) * np.diag(self._prior)
         calibrated = -self._corrected * self._is_of_lens
-        self._x = calibrated + kept * (self._x - calibrated)
-        self._P = np.outer(kept, kept) * self._P + widened[:, :, None] * np.eye(len(kept))
+        self._x = calibrated + decays * (self._x - calibrated)
+        self._P = np.outer(decays, decays) * self._P + widened[:, :, None] * np.eye(len(decays))
         self._evidence *= decay
 
     def _agrees(self, H: Array, off: Array) -> bool:
@@ -210,19 +209,24 @@ class Refinement:
         return self._image_px(np.outer(x, x))
 
     @property
+    def _sigma_px(self) -> Array:
+        """(C,) standard deviations of what `off_px` estimates."""
+        return self._image_px(self.relative @ self.P @ self.relative.T)
+
+    @property
     def is_significant(self) -> bool:
         """Whether a camera is off by more than windows have of their own and is uncertain yet, as each camera that
         changed is, and none so far that its markers were mistaken."""
         off_px = self.off_px
-        is_known = off_px > LARGE * self._image_px(self.relative @ self.P @ self.relative.T)
+        is_known = off_px > LARGE * self._sigma_px
         is_off = (is_known & (off_px > LARGE * USUAL_PX)).any()
         return bool(is_off and (off_px < GATES_PX[-1]).all() and is_known[sorted(self._freed)].all())
 
     @property
     def excess(self) -> float:
         """By how much errors may be larger than the rig states where a camera is off but not known yet; 1 else."""
-        off_px, sigma_px = self.off_px, self._image_px(self.relative @ self.P @ self.relative.T)
-        ratios = np.hypot(off_px, sigma_px) / np.maximum(self._image_px(self._stated), USUAL_PX)
+        off_px = self.off_px
+        ratios = np.hypot(off_px, self._sigma_px) / np.maximum(self._image_px(self._stated), USUAL_PX)
         return max(1.0, float(ratios[off_px > LARGE * USUAL_PX].max(initial=1.0)))
 
     def _image_px(self, covariance: Array) -> Array:
@@ -252,13 +256,12 @@ class Refinement:
     def _in_common(self) -> Array:
         """(8 C, 8 C) covariance of the motion since the calibration that all cameras have in common, which robots do
         not show: mounts moved independently, by a variance that their motions relative to each other show."""
-        unit = np.tile([1.0] * 3 + [ARM_M] * 3, len(self.cameras))
-        together = errors_of_motion(np.array([camera.matrix() for camera in self.cameras.values()]))
-        A = together[self._is_of_pose] / unit[:, None]
-        moved = self._corrected[self._is_of_pose] / unit
+        poses = self._of_mounts > 0
+        A = self._together[poses] / self._of_mounts[poses, None]
+        moved = self._corrected[poses] / self._of_mounts[poses]
         relative = moved - A @ np.linalg.lstsq(A, moved, rcond=None)[0]
         variance = relative @ relative / max(1, len(moved) - A.shape[1])
-        return variance * together @ np.linalg.pinv(A.T @ A, hermitian=True) @ together.T
+        return variance * self._together @ np.linalg.pinv(A.T @ A, hermitian=True) @ self._together.T
 
 
 def _displaced(camera: Camera, errors: Array) -> Camera:
@@ -282,14 +285,12 @@ def _gain(score: Array, information: Array, rows: Index, sigma: Array) -> float:
     return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1])
 
 
-def _relative_to_all(cameras: Sequence[Camera], metrics: Array) -> Array:
-    """(8 C, 8 C) that takes from errors of the cameras the motion that explains most of the images of all of them:
-    that of the common frame."""
-    together = errors_of_motion(np.array([camera.matrix() for camera in cameras]))
-    weighted = np.einsum("kij,kjm->kim", metrics, together.reshape(len(cameras), ERRORS, 6)).reshape(-1, 6)
-    return (
-        np.eye(len(together)) - together @ np.linalg.pinv(weighted.T @ together, hermitian=True) @ weighted.T
-    )
+def _relative_to_all(together: Array, metrics: Array) -> Array:
+    """(8 C, 8 C) that takes from errors of the cameras the motion that explains most of the images of all of them, of
+    those that all have in `together` (8 C, 6): that of the common frame."""
+    weighted = (metrics @ together.reshape(len(metrics), ERRORS, -1)).reshape(together.shape)
+    motion = np.linalg.pinv(weighted.T @ together, hermitian=True) @ weighted.T
+    return np.eye(len(together)) - together @ motion
 
 
 def _own_covariance(cameras: Sequence[Camera], metrics: Array) -> Array:

@@ -15,12 +15,14 @@ from calib.rig.camera_errors import (
     USUAL_PX,
     as_pose_errors,
     error_covariance,
+    errors_of_motion,
     image_errors,
     with_errors,
     working_ranges,
 )
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.world.world_frame import scale_rig
+from camera_node.geometry.pose import rotation_from_vector, vector_from_rotation
 from tests.fusion.synthetic import ring
 
 CAMERAS = list(ring().values())
@@ -36,6 +38,19 @@ def test_a_stated_turn_displaces_the_image_by_focal_length_times_angle():
     turn = tuple(map(tuple, np.diag([1e-4, 1e-4, 0, 0, 0, 0])[:, :] ** 2))
     cameras = [msgspec.structs.replace(camera, covariance=turn) for camera in CAMERAS]
     assert image_errors(cameras, error_covariance(cameras)) == pytest.approx(np.full(4, 0.065), rel=0.3)
+
+
+def test_errors_of_a_common_motion_move_all_cameras_by_it():
+    """To first order, in the frame of each camera."""
+    T = np.array([camera.matrix() for camera in CAMERAS])
+    turn, shift = 1e-6 * np.array([[1, -2, 3], [2, 1, -1]])
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation_from_vector(turn[None])[0], shift
+    moved = np.linalg.inv(T) @ motion @ T
+    errors = (errors_of_motion(T) @ [*turn, *shift]).reshape(-1, ERRORS)
+    assert errors[:, :3] == pytest.approx(vector_from_rotation(moved[:, :3, :3]), abs=1e-10)
+    assert errors[:, 3:6] == pytest.approx(moved[:, :3, 3], abs=1e-10)  # turn^2 x 5 m
+    assert not errors[:, 6:].any()
 
 
 @pytest.mark.parametrize("n", [1, 2, 4])

@@ -111,15 +111,16 @@ def test_a_lens_that_changes_is_corrected(percent: float):
         if refinement.is_significant:
             refined.append(refinement.correct(()))
             assert not refinement.is_significant
-    left = applied(refinement.cameras, {**cameras, "cam2": changed}).reshape(-1, ERRORS)
-    assert (image_px(left, metrics) < LARGE * USUAL_PX + NOISE_PX).all()  # of 0.6 px: less is not corrected
+    off_px = image_px(applied(refinement.cameras, {**cameras, "cam2": changed}), metrics)
+    assert off_px[2] < LARGE * USUAL_PX + NOISE_PX  # of 0.6 px: less is not corrected
+    assert np.delete(off_px, 2).max() < USUAL_PX
     assert refined
     assert all("camera cam2 by" in str(found) for found in refined)
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize(("rate", "most_px"), [(1.0, 0.2), (10.0, 0.5)])
-def test_poses_that_drift_are_followed_and_claimed(rate: float, most_px: float):
+@pytest.mark.parametrize(("rate", "n_windows"), [(1.0, 1500), (10.0, 600)])
+def test_poses_that_drift_are_followed_and_claimed(rate: float, n_windows: int):
     """All cameras turn by half a degree in an hour, and sink by 5 mm, or ten times as fast. Each correction states what
     is left, with what all have in common, and the next go on from it."""
     cameras, rng = ring(4), np.random.default_rng(3)
@@ -129,8 +130,8 @@ def test_poses_that_drift_are_followed_and_claimed(rate: float, most_px: float):
     down = -T[:, 2, :3] * 5e-3 / 3600
     metrics = image_metrics(list(cameras.values()))
     refinement, windows, n_corrections = Refinement(cameras, since(4)), Windows(cameras, rng), 0
-    relative_px, squared = [], []
-    for k in range(600):
+    off_px, squared = [], []
+    for k in range(n_windows):
         drifted = np.zeros((4, ERRORS))
         drifted[:, :6] = rate * np.column_stack([axes, down]) * k * WINDOW_NS * 1e-9
         used = {
@@ -142,14 +143,14 @@ def test_poses_that_drift_are_followed_and_claimed(rate: float, most_px: float):
         if refinement.is_significant:
             refinement.correct(())
             n_corrections += 1
-            left = applied(refinement.cameras, used)[np.tile(OF_IMAGE, 4)]
-            stated = error_covariance(list(refinement.cameras.values()))
-            stated = stated[np.ix_(np.tile(OF_IMAGE, 4), np.tile(OF_IMAGE, 4))]
+            of_image = np.flatnonzero(np.tile(OF_IMAGE, 4))
+            left = applied(refinement.cameras, used)[of_image]
+            stated = error_covariance(list(refinement.cameras.values()))[np.ix_(of_image, of_image)]
             squared.append(left @ np.linalg.solve(stated, left) / len(left))
-        relative_px.append(image_px(refinement.relative @ errors, metrics).max())
+        off_px.append(image_px(errors, metrics).max())
     assert n_corrections > 3
-    assert max(relative_px) < most_px
-    assert np.mean(squared) < 2
+    assert max(off_px) < 0.25  # of 1.4 and 5.2 px
+    assert max(squared) < 2  # 2.7 without what all have in common
 
 
 def test_a_clock_or_one_of_three_cameras_changes_no_pose():
@@ -190,9 +191,8 @@ def test_errors_that_are_not_known_are_claimed():
     for k in range(3):
         refinement.update(START_NS + k * WINDOW_NS, H, 1e-3 * H[:, 0], np.zeros(4), np.zeros((4, 4)))
     assert not refinement.is_significant
-    off_px = image_px(
-        refinement.relative @ np.eye(4 * ERRORS)[0] * 1e-3, image_metrics(list(cameras.values()))
-    )
+    turned = 1e-3 * refinement.relative[:, 0]
+    off_px = image_px(turned, image_metrics(list(cameras.values())))
     assert refinement.excess * USUAL_PX > off_px[0] / 2  # as large as if either of them turned by half
 
 
