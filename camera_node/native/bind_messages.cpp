@@ -5,25 +5,21 @@
 #include <nanobind/stl/string.h>
 
 #include <algorithm>
-#include <bit>
 #include <cmath>
-#include <cstring>
 #include <limits>
 #include <string>
+
+#include "numeric/unaligned.hpp"
 
 namespace nb = nanobind;
 
 namespace {
 
-static_assert(std::endian::native == std::endian::little, "columns of messages are little-endian");
 constexpr double kMaxCoordinate = 1e5;  // pixels
 
-/// The number `k` of a column; bytes have no alignment.
 template <class T>
 T number(const nb::bytes& column, size_t k) {
-    T value;
-    std::memcpy(&value, static_cast<const char*>(column.c_str()) + k * sizeof(T), sizeof(T));
-    return value;
+    return roundel::number_at<T>(column.c_str(), k);
 }
 
 /// Whether all centres (pairs of doubles) are finite, and covariances (floats uu, uv, vv) positive definite

@@ -215,6 +215,7 @@ class Detections(ColumnMessage, frozen=True, kw_only=True):
         shape = self.uv, self.cov, self.axes_px, self.angle_rad, self.ratio, self.contrast
         codes = self.id, self.track, self.id_probability, self.rotation_rad, self.rotation_sigma
         if fault := _core.fault_of_detections(self.MAX_ROWS, MAX_VARIANCE_PX2, *shape, *codes):
+            self._check_sizes()  # says which column
             raise MessageError(fault)
 
     def _check_header(self) -> None:

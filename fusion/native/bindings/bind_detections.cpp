@@ -2,13 +2,13 @@
 #include <nanobind/stl/tuple.h>
 
 #include <algorithm>
-#include <cstring>
 
 #include "arrays.hpp"
 #include "assignment.hpp"
 #include "candidates.hpp"
 #include "inverse_lens.hpp"
 #include "labelings.hpp"
+#include "numeric/unaligned.hpp"
 
 namespace roundel::fusion {
 namespace {
@@ -160,18 +160,13 @@ void forget_impossible(double* outlines, size_t n) {
     }
 }
 
-/// Writes these numbers of all rows of a column of a message, one after another; bytes have no alignment.
+/// Writes these numbers of all rows of a column of a message, one after another.
 template <class From>
 double* append(double* to, const nb::bytes& column, size_t n, size_t width,
                std::initializer_list<size_t> order) {
     if (column.size() != n * width * sizeof(From)) throw nb::value_error("columns of different lengths");
     for (const size_t i : order)
-        for (size_t k = 0; k < n; ++k) {
-            From value;
-            const size_t at = (k * width + i) * sizeof(From);
-            std::memcpy(&value, static_cast<const char*>(column.c_str()) + at, sizeof(From));
-            *to++ = double(value);
-        }
+        for (size_t k = 0; k < n; ++k) *to++ = double(number_at<From>(column.c_str(), k * width + i));
     return to;
 }
 

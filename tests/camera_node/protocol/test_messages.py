@@ -112,7 +112,7 @@ GOOD = Detections.pack(Roundels.from_points(np.ones((2, 2)), 0.3), **HEADER)
 
 @pytest.mark.parametrize("column", COLUMNS)
 def test_columns_of_other_lengths_are_refused(column: str):
-    with pytest.raises(MessageError, match="column"):
+    with pytest.raises(MessageError, match=f"column {column} of"):
         decode(encode(msgspec.structs.replace(GOOD, **{column: getattr(GOOD, column) + b"\0"})), Detections)
 
 
@@ -147,7 +147,7 @@ def test_impossible_content_is_refused(change: dict):
 
 def test_a_message_with_too_many_roundels_is_refused():
     many = Detections.pack(Roundels.from_points(np.ones((MAX_ROUNDELS + 1, 2)), 0.3), **HEADER)
-    with pytest.raises(MessageError):
+    with pytest.raises(MessageError, match=f"{MAX_ROUNDELS + 1} roundels"):
         decode(encode(many), Detections)
 
 
