@@ -232,6 +232,27 @@ def predict(
     densities (N, 2) and single (N,): see `fusion.model.states.predict`.
     """
 
+def weigh_motions(
+    bodies: BodyStates,
+    P: Array,
+    information: Array,
+    dt: Array,
+    densities: Array,
+    single: NDArray[np.bool_],
+    equations: Array,
+    body: Index,
+    before: Array,
+    shares: Array,
+    /,
+) -> tuple[Array, Array, Array]:
+    """Probabilities (B, K) of K models given the observations of a frame set, and P and information (B, 12, 12) by the
+    geometric mean of their densities; those of bodies without observations do not change.
+
+    B predicted bodies: their P, its inverse, dt (B,), densities (B, 2) and single (B,) as of `predict`. equations (N,
+    2, 13) of centres and their body (N,); before (B, K) probabilities; shares (K,) of the densities: see
+    `native/motion_models.hpp`.
+    """
+
 def eliminate_robots(
     equations: Array,
     weights: Array,

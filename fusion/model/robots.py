@@ -43,7 +43,8 @@ MANOEUVRE_S = 0.1  # duration of an acceleration; converts accelerations to dens
 
 
 class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Typical accelerations of a robot, each lasting about `MANOEUVRE_S`."""
+    """The largest accelerations of a robot's usual motion, each lasting about `MANOEUVRE_S`; `tracking/motion_models`
+    estimates how much less it does."""
 
     acceleration_m_s2: float
     angular_acceleration_rad_s2: float

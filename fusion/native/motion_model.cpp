@@ -60,4 +60,14 @@ Matrix predict(Body& body, ErrorMatrix& P, const MotionInterval& interval) {
     return by_rate;
 }
 
+ErrorMatrix process_noise(const Body& predicted, const MotionInterval& interval) {
+    const Matrix half = rotation_from_vector((interval.dt / 2) * predicted.omega);
+    ErrorMatrix Q{};
+    add_noise(Q, block_of(transposed(transposed(half) * predicted.R)), interval);
+    if (interval.single)
+        for (const int unknown : {kTheta + 2, kOmega, kOmega + 1, kOmega + 2})
+            for (int j = 0; j < kErrors; ++j) Q[unknown][j] = Q[j][unknown] = 0;
+    return Q;
+}
+
 }  // namespace roundel::fusion

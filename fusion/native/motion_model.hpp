@@ -17,4 +17,8 @@ struct MotionInterval {
 /// errors of the angular velocity.
 Matrix predict(Body& body, ErrorMatrix& P, const MotionInterval& interval);
 
+/// The part Q of the covariance of a predicted body, without that of errors which a single marker does not
+/// determine.
+ErrorMatrix process_noise(const Body& predicted, const MotionInterval& interval);
+
 }  // namespace roundel::fusion

@@ -143,11 +143,15 @@ class Estimator:
         """With the noise of late frames and of the clocks of the cameras."""
         return self._inflate_by_clock(states, self._inflate_late(states, observations))
 
-    def innovations(self, states: States, observations: MatchedObservations) -> tuple[Array, Array]:
-        """The whitened derivatives (2 N, 12) of N centres by the errors of their bodies, and innovations (2 N,)."""
+    def centres(self, states: States, observations: MatchedObservations) -> Array:
+        """(N, 2, 13) equations of N centres: whitened derivatives by the errors of their bodies, and innovations."""
         seen, discs = observations.detections, observations.discs
         poses = self.cameras.frame_poses(states, seen.exposures)
-        equations = poses.linearize_centres(discs.columns, seen.xy, observations.whiten, self.single)
+        return poses.linearize_centres(discs.columns, seen.xy, observations.whiten, self.single)
+
+    def innovations(self, states: States, observations: MatchedObservations) -> tuple[Array, Array]:
+        """The whitened derivatives (2 N, 12) of N centres by the errors of their bodies, and innovations (2 N,)."""
+        equations = self.centres(states, observations)
         return equations[:, :, :12].reshape(-1, 12), equations[:, :, 12].ravel()
 
     def squared_px(self, states: States, observations: MatchedObservations) -> Array:

@@ -13,7 +13,7 @@ from fusion.model.corrections import ExtrinsicsCorrection, RigRefinement
 from fusion.model.frames import CalibratedFrame, FrameSet
 from fusion.model.limits import Limits
 from fusion.model.marker_places import PLACE_M
-from fusion.model.observations import Assignments, CameraArray, DetectionTable
+from fusion.model.observations import Assignments, CameraArray, DetectionTable, MatchedObservations
 from fusion.model.robots import Robot
 from fusion.model.states import FrameSetFit, Snapshot
 from fusion.monitoring.camera_monitors import CameraMonitors
@@ -25,6 +25,7 @@ from fusion.tracking.association import AssignedFrames, AssociatedFrames, Associ
 from fusion.tracking.claim_check import ClaimCheck
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.labelings import choose_labelings
+from fusion.tracking.motion_models import MotionModels
 from fusion.tracking.rays import Marker
 from fusion.tracking.result import (
     FilterStep,
@@ -35,7 +36,7 @@ from fusion.tracking.result import (
     robot_poses,
 )
 from fusion.tracking.rig_response import RigResponse
-from fusion.tracking.robust_update import RobustUpdate
+from fusion.tracking.robust_update import RobustFit, RobustUpdate
 from fusion.tracking.single_view import SingleViewTracker
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
@@ -100,6 +101,7 @@ class Tracker:
         )  # without robots too
         self.estimator = Estimator(self.cameras, densities, self.table.single)
         self.own = OwnDetections(self.cameras, self.estimator, self.table.markers)
+        self.motion = MotionModels(self.estimator)
         self.robust = RobustUpdate(self.estimator, self.table.markers)
         self.rig_response = RigResponse(self.estimator)
         self.acquisition = Acquisition(self.cameras, self.estimator)
@@ -137,7 +139,9 @@ class Tracker:
         """
         if early is not None and early.association.is_of(t_ns, self.cameras, self.table.markers):
             return early
-        self.rig_response.forget(self.table.apply_received())
+        received = self.table.apply_received()
+        self.rig_response.forget(received)
+        self.motion.restart(received)
         dt = np.full(len(self.table.robots), self.table.interval_s(t_ns))
         prediction = self.estimator.predict(self.table.states, dt)
         tracked = self.table.associable(prediction.states)
@@ -158,12 +162,13 @@ class Tracker:
         needed = self.table.needed_detections(associated.prediction.states, spread_s)
         scene = self.estimator, self.table.markers, associated.prediction, needed, detections
         all_assigned = choose_labelings(*scene, all_assigned, labelings)
-        assignments = self._update_states(associated, needed, detections, all_assigned)
+        fitted = self._update_states(associated, needed, detections, all_assigned)
+        assignments = fitted.assignments
         self.table.observe(t_ns, assignments)
         summary = self._summarize(detections, assignments)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
-        return Update(t_ns, associated.prediction, tracked, detections, assignments, summary, poses)
+        return Update(t_ns, fitted.prediction, tracked, detections, assignments, summary, poses)
 
     def finish(self, update: Update) -> TrackingResult:
         """Acquire missing robots, track unlabeled markers, and report the frame set."""
@@ -201,6 +206,7 @@ class Tracker:
         other.acquires_none = self.acquires_none
         same = other.table.inherit(self.table, renamed)
         other.monitors.inherit(self.monitors, same)
+        other.motion.inherit(self.motion, same)
         other.rig_response.inherit(self.rig_response, same)
         other.table.claimed = other.rig_response.claimed(other.table.states, other.table.markers)
         return other
@@ -262,16 +268,20 @@ class Tracker:
         needed: Index,
         detections: DetectionTable,
         assignments: Assignments,
-    ) -> Assignments:
-        """Update the states of the robots; returns the assignments that fit, with residuals."""
+    ) -> RobustFit:
+        """Update the states of the robots; its assignments are those that fit, with residuals."""
         prediction, tracked = associated.prediction, associated.tracked
         given = AssignedFrames(prediction, tracked, detections, assignments)
         own = assignments.select(self.own.are_own(given, self.robust.noise_px2))
+        noisy = detections.with_noise(self.robust.added_px2)
+        prediction = self.motion.narrowed(
+            prediction, MatchedObservations.of(own, noisy, self.table.markers)
+        )
         fitted = self.robust.update(prediction, needed, detections, own)
         self.table.states = fitted.states
         self.rig_response.update(fitted)
         self._claim()
-        return fitted.assignments
+        return fitted
 
     def _acquire(self, update: Update) -> tuple[Update, Acquired]:
         """Acquire missing robots; returns the update with their assignments."""
@@ -283,6 +293,7 @@ class Tracker:
         self._reasons = found.reasons
         for fits in found.fits:
             self.table.adopt(fits.robot, fits.states)
+            self.motion.restart(fits.robot)
             self.rig_response.restart(self.table.states, fits)
         self.table.lose(found.displaced)
         if found.fits:

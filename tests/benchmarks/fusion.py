@@ -82,6 +82,12 @@ def _accuracies(thorough: bool) -> Iterator[Row]:
             "1",
             _verdict(free.honesty < 1.25),
         )
+        yield (
+            f"{what}: velocity, RMS, and squared error by covariance",
+            f"{free.velocity_mm_s:.1f} mm/s, {free.velocity_honesty:.2f}",
+            "1",
+            _verdict(free.velocity_honesty < 1.5),
+        )
 
 
 def _capacities(thorough: bool) -> Iterator[Row]:

@@ -21,6 +21,7 @@ class Accuracy:
     """RMS position errors in mm: of the tracker, of a filter with known associations, and from its covariance.
 
     `honesty` is the mean squared Mahalanobis error of the tracker's poses over their 6 degrees of freedom.
+    `velocity_mm_s` is the RMS error of the tracker's velocities, `velocity_honesty` that over their claims.
     """
 
     tracker_mm: float
@@ -28,6 +29,8 @@ class Accuracy:
     bound_mm: float
     honesty: float
     tracked: float
+    velocity_mm_s: float
+    velocity_honesty: float
 
 
 def accuracy(load: Load, seconds: float) -> Accuracy:
@@ -37,6 +40,7 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
     tracker.table.markers.frame[:] = 0.0  # of robots that are measured as precisely as the cameras
     known = KnownFilter(cameras, load.bodies, lambda t_ns: load.paths.at((t_ns - START_NS) * 1e-9))
     mine, theirs, variance, honesty, tracked = [], [], [], [], []
+    velocity, velocity_honesty = [], []
     for k, frame_set in enumerate(frame_sets(load, seconds)):
         tracker.track(frame_set)
         known.update(frame_set)
@@ -47,12 +51,19 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
         tracked.append(alive.mean())
         error = tracker.table.states.p - truth.p
         mine.append(np.sum(error[alive] ** 2, 1))
+        off, P = (tracker.table.states.v - truth.v)[alive], tracker.table.claimed[alive, 9:, 9:]
+        velocity.append(np.sum(off**2, 1))
+        velocity_honesty.append(np.sum(off * np.linalg.solve(P, off[..., None])[..., 0], 1))
         theirs.append(np.sum((known.states.p - truth.p) ** 2, 1))
         variance.append(np.einsum("nii->n", known.states.P[:, 3:6, 3:6]))
         honesty.append(_mahalanobis(tracker.table.states.R, truth.R, error, tracker.table.claimed)[alive])
     rms = [1e3 * float(np.sqrt(np.mean(np.concatenate(x)))) for x in (mine, theirs, variance)]
     return Accuracy(
-        rms[0], rms[1], rms[2], float(np.mean(np.concatenate(honesty)) / 6), float(np.mean(tracked))
+        *rms,
+        float(np.mean(np.concatenate(honesty)) / 6),
+        float(np.mean(tracked)),
+        1e3 * float(np.sqrt(np.mean(np.concatenate(velocity)))),
+        float(np.mean(np.concatenate(velocity_honesty)) / 3),
     )
 
 

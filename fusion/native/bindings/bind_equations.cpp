@@ -5,7 +5,7 @@
 
 #include "arrays.hpp"
 #include "elimination.hpp"
-#include "motion_model.hpp"
+#include "motion_models.hpp"
 
 namespace roundel::fusion {
 namespace {
@@ -26,8 +26,8 @@ auto are_own(const In<double, -1, 2, 12>& A, const In<double, -1, 2>& nu, const 
     const size_t n = body.size(), n_asked = of_body.size();
     require_equal(n, {A.shape(0), nu.shape(0), log_density.size(), camera.size(), certain.size()});
     require_equal(n_asked, {of_camera.size(), turn.size(), prior.size(), added_px2.size()});
-    const Evidence evidence{reinterpret_cast<const double (*)[2][kErrors]>(A.data()),
-                            reinterpret_cast<const double (*)[2]>(nu.data()),
+    const Evidence evidence{reinterpret_cast<const double(*)[2][kErrors]>(A.data()),
+                            reinterpret_cast<const double(*)[2]>(nu.data()),
                             columns<4>(cov, n),
                             log_density.data(),
                             body.data(),
@@ -101,12 +101,43 @@ auto predict_bodies(const BodyStates& bodies, const Covariances& P, const Number
     return std::make_tuple(R_then, p_then, P_then, T);
 }
 
+auto weigh_motions_of(const BodyStates& bodies, const Covariances& P, const Covariances& information,
+                      const Numbers& dt, const In<double, -1, 2>& densities, const Mask& single,
+                      const EquationArray& equations, const Index& body,
+                      const In<double, -1, kModels>& before, const In<double, kModels>& shares) {
+    const size_t n = bodies.size(), n_models = shares.size();
+    require_equal(
+        n, {P.shape(0), information.shape(0), dt.size(), densities.shape(0), single.size(), before.shape(0)});
+    require_equal(body.size(), {equations.shape(0)});
+    std::vector<MotionInterval> intervals;
+    for (size_t b = 0; b < n; ++b) intervals.push_back({dt(b), densities(b, 0), densities(b, 1), single(b)});
+    auto [probabilities, to_probabilities] = make({n, kModels});
+    auto [P_seen, to_P] = make({n, kErrors, kErrors});
+    auto [information_seen, to_information] = make({n, kErrors, kErrors});
+    std::copy_n(before.data(), before.size(), to_probabilities);
+    std::copy_n(P.data(), P.size(), to_P);
+    std::copy_n(information.data(), information.size(), to_information);
+    const PredictedBodies predicted{
+        bodies.data(),
+        reinterpret_cast<const ErrorMatrix*>(P.data()),
+        intervals.data(),
+        {reinterpret_cast<const Equations*>(equations.data()), below(n, body), body.size(), n}};
+    ModelNumbers of_declared;
+    std::copy_n(shares.data(), kModels, of_declared.begin());
+    unlocked([&, of_bodies = to_probabilities, out = to_P, inverted = to_information] {
+        weigh_motions(predicted, of_declared, of_bodies, reinterpret_cast<ErrorMatrix*>(out),
+                      reinterpret_cast<ErrorMatrix*>(inverted));
+    });
+    return std::make_tuple(probabilities, P_seen, information_seen);
+}
+
 }  // namespace
 
 void bind_equations(nb::module_& m) {
     m.attr("CAUCHY") = kCauchy;
     m.attr("NOMINAL_WEIGHT") = kNominalWeight;
     m.def("predict", &predict_bodies);
+    m.def("weigh_motions", &weigh_motions_of);
     m.def("are_own", &are_own);
     m.def("eliminate_robots", &eliminate_robots);
     m.def("inverses", &inverses);

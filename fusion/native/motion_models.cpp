@@ -1,0 +1,129 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#include "motion_models.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "numeric/simd.hpp"
+
+namespace roundel::fusion {
+namespace {
+
+/// Of a pivot to its element before: what rounding leaves of zero is less.
+constexpr double kSingular = 1e-9;
+
+/// The observations of a body as independent errors z of unit variance, to which the errors of its state
+/// contribute G^T delta: with H = A^T A and g = A^T b over the equations, H = G G^T and g = G z. Columns of G
+/// are zero where H is singular.
+struct ReducedObservations {
+    ErrorMatrix G{};
+    ErrorVector z{};
+};
+
+ROUNDEL_CLONES void add(const Equations& equations, ErrorMatrix& H, ErrorVector& g) {
+    for (const auto& row : equations.A)
+        for (int i = 0; i < kErrors; ++i) {
+            for (int j = 0; j < kErrors; ++j) H[i][j] += row[i] * row[j];
+            g[i] += row[i] * row[kErrors];
+        }
+}
+
+ROUNDEL_CLONES ReducedObservations reduce(ErrorMatrix H, ErrorVector g) {
+    ReducedObservations to;
+    const ErrorMatrix whole = H;
+    for (int j = 0; j < kErrors; ++j) {
+        if (H[j][j] <= kSingular * whole[j][j]) continue;
+        const double root = std::sqrt(H[j][j]);
+        to.z[j] = g[j] / root;
+        ErrorVector column{};
+        for (int i = j; i < kErrors; ++i) to.G[i][j] = column[i] = H[i][j] / root;
+        for (int i = j + 1; i < kErrors; ++i) {
+            for (int k = 0; k < kErrors; ++k) H[i][k] -= column[i] * column[k];
+            g[i] -= column[i] * to.z[j];
+        }
+    }
+    return to;
+}
+
+/// G^T P G.
+ROUNDEL_CLONES ErrorMatrix congruent(const ErrorMatrix& G, const ErrorMatrix& P) {
+    ErrorMatrix half{}, whole{};
+    for (int i = 0; i < kErrors; ++i)
+        for (int k = 0; k < kErrors; ++k)
+            for (int j = 0; j < kErrors; ++j) half[i][j] += P[i][k] * G[k][j];
+    for (int i = 0; i < kErrors; ++i)
+        for (int j = 0; j < kErrors; ++j)
+            for (int k = 0; k < kErrors; ++k) whole[j][k] += G[i][j] * half[i][k];
+    return whole;
+}
+
+/// P + by Q.
+ErrorMatrix sum(const ErrorMatrix& P, double by, const ErrorMatrix& Q) {
+    ErrorMatrix to;
+    for (int i = 0; i < kErrors; ++i)
+        for (int j = 0; j < kErrors; ++j) to[i][j] = P[i][j] + by * Q[i][j];
+    return to;
+}
+
+/// A number of each model; GCC and Clang compute them at once.
+typedef double Models __attribute__((vector_size(8 * kModels)));
+
+/// -2 ln of the densities of z, whose covariances are S + by T, less a constant: S + by T = L D L^T.
+ROUNDEL_CLONES void costs_of(const ErrorVector& z, const ErrorMatrix& S, const ErrorMatrix& T,
+                             const ModelNumbers& by, ModelNumbers& costs) {
+    Models L[kErrors][kErrors], D[kErrors], y[kErrors], factor, squares{}, determinant = Models{} + 1.0;
+    std::copy_n(by.data(), kModels, reinterpret_cast<double*>(&factor));
+    for (int i = 0; i < kErrors; ++i) {
+        D[i] = S[i][i] + factor * T[i][i];
+        y[i] = Models{} + z[i];
+        for (int j = 0; j < i; ++j) {
+            Models scaled = S[i][j] + factor * T[i][j];  // L_ij D_j
+            for (int k = 0; k < j; ++k) scaled -= L[i][k] * D[k] * L[j][k];
+            L[i][j] = scaled / D[j];
+            D[i] -= scaled * L[i][j];
+            y[i] -= L[i][j] * y[j];
+        }
+        squares += y[i] * y[i] / D[i];
+        determinant *= D[i];
+    }
+    for (int m = 0; m < kModels; ++m) costs[m] = std::log(determinant[m]) + squares[m];
+}
+
+/// Multiplies probabilities by likelihoods, given as costs.
+void weigh(const ModelNumbers& costs, double* probabilities) {
+    const double least = *std::min_element(costs.begin(), costs.end());
+    double total = 0;
+    for (int m = 0; m < kModels; ++m) total += probabilities[m] *= std::exp((least - costs[m]) / 2);
+    for (int m = 0; m < kModels; ++m) probabilities[m] /= total;
+}
+
+}  // namespace
+
+void weigh_motions(const PredictedBodies& predicted, const ModelNumbers& shares, double* probabilities,
+                   ErrorMatrix* P, ErrorMatrix* information) {
+    const ByBody of(predicted.observed);
+    ModelNumbers less, costs;  // of the declared densities, all of which are in P
+    for (int m = 0; m < kModels; ++m) less[m] = shares[m] - 1;
+    for (size_t b = 0; b < predicted.observed.n_bodies; ++b) {
+        if (of.first[b] == of.first[b + 1]) continue;
+        ErrorMatrix H{};
+        ErrorVector g{};
+        for (size_t at = of.first[b]; at < of.first[b + 1]; ++at)
+            add(predicted.observed.equations[of.indices[at]], H, g);
+        const auto [G, z] = reduce(H, g);
+        const ErrorMatrix noise = process_noise(predicted.bodies[b], predicted.intervals[b]);
+        ErrorMatrix S = congruent(G, predicted.P[b]);
+        for (int i = 0; i < kErrors; ++i) S[i][i] += 1;
+        costs_of(z, S, congruent(G, noise), less, costs);
+        if (!std::all_of(costs.begin(), costs.end(), [](double cost) { return std::isfinite(cost); }))
+            continue;  // beyond the accuracy of numbers: as declared
+        double* of_body = probabilities + b * kModels;
+        weigh(costs, of_body);
+        double mean = 0;
+        for (int m = 0; m < kModels; ++m) mean += of_body[m] * std::log(shares[m]);
+        P[b] = sum(predicted.P[b], std::exp(mean) - 1, noise);
+        information[b] = inverse(P[b]);
+    }
+}
+
+}  // namespace roundel::fusion

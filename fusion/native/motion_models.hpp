@@ -1,0 +1,26 @@
+// SPDX-License-Identifier: BSD-3-Clause
+#pragma once
+#include "motion_model.hpp"
+
+/// Bayesian choice among motion models that differ in the density of accelerations; see fusion_filter.md.
+namespace roundel::fusion {
+
+/// B predicted bodies: states, covariances by the declared densities, the intervals that they were predicted
+/// by, and the linearized centres of their detections.
+struct PredictedBodies {
+    const Body* bodies;
+    const ErrorMatrix* P;
+    const MotionInterval* intervals;
+    EquationSystem observed;
+};
+
+constexpr int kModels = 4;
+using ModelNumbers = std::array<double, kModels>;
+
+/// Weighs the models of the bodies that are observed by their shares of the declared densities:
+/// `probabilities` (B x 4) become those given the observations, `P` and `information` those by the geometric
+/// mean of the densities. They stay as declared where rounding leaves no likelihood.
+void weigh_motions(const PredictedBodies& predicted, const ModelNumbers& shares, double* probabilities,
+                   ErrorMatrix* P, ErrorMatrix* information);
+
+}  // namespace roundel::fusion
