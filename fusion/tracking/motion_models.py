@@ -3,9 +3,10 @@
 
 `robots.yaml` declares what a robot may do. Most of the time it does less, and at rest nothing: a filter that expects
 more takes the noise of detections for velocities. So the density of the white noise on acceleration is an unknown of
-each robot, at most the declared one, which may change at any time: a Markov chain of models, one for each density (Blom
-and Bar-Shalom 1988; Bar-Shalom et al. 2001, section 11.6). With the whitened derivatives A and innovations b of the
-detections of a frame set, H = sum A^T A, g = sum A^T b, and P' the covariance of a model's prediction, the likelihood is
+each robot, at most the declared one, which may change at any time: a Markov chain of models, one for each density
+(Blom and Bar-Shalom 1988; Bar-Shalom et al. 2001, section 11.6). With the whitened derivatives A and innovations b of
+the detections of a frame set, H = sum A^T A, g = sum A^T b, and P' the covariance of a model's prediction, its
+likelihood is
 
     -2 ln L = ln det P' + ln det(P'^-1 + H) - g^T (P'^-1 + H)^-1 g + constant.
 
@@ -21,12 +22,14 @@ import numpy as np
 
 from camera_node.foundation.arrays import Index
 from fusion import _core
-from fusion.model.observations import MatchedObservations
+from fusion.model.observations import MatchedObservations, views
 from fusion.tracking.estimator import Estimator, Prediction
 
 # Of the declared density, as of accelerations of 10 m/s^2 (`aerial`), 2.2, 0.5 and 0.1 m/s^2, which is at rest.
 SHARES = np.array([1.0, 1 / 20, 1 / 400, 1 / 8000])
-PHASE_S = 0.5  # mean duration of a phase of motion with one density, as of starting, driving evenly, or turning
+PHASE_S = (
+    0.5  # mean duration of a phase of motion with one density, as of starting, driving evenly, or turning
+)
 
 
 class MotionModels:
@@ -40,8 +43,8 @@ class MotionModels:
         self._estimator, n = estimator, len(estimator.single)
         self.probabilities = np.tile(SHARES == 1, (n, 1)).astype(float)
 
-    def restart(self, rows: Index) -> None:
-        """Expect the declared motion of robots that were acquired."""
+    def restart(self, rows: Index | slice = slice(None)) -> None:
+        """Expect the declared motion of robots: of those that were acquired, or of all."""
         self.probabilities[rows] = SHARES == 1
 
     def inherit(self, old: "MotionModels", same: Mapping[int, int]) -> None:
@@ -49,13 +52,17 @@ class MotionModels:
         self.probabilities[list(same)] = old.probabilities[list(same.values())]
 
     def narrowed(self, prediction: Prediction, observations: MatchedObservations) -> Prediction:
-        """The prediction by the densities that the observations show; by the declared ones without any.
+        """The prediction by the densities that the observations show; by the declared ones of robots that fewer than
+        two cameras see, because one shows no motion along its rays.
 
         Args:
             prediction: of all robots, by the declared densities.
-            observations: of a frame set.
+            observations: of a frame set that does not contradict the rig: else innovations show no motion.
         """
         estimator, states, dt = self._estimator, prediction.states, prediction.motion.dt
+        body, camera = observations.discs.body, observations.detections.camera
+        n_cameras = views(body, camera, len(states)).sum(1)
+        observations = observations.select(n_cameras[body] > 1)
         stays = np.exp(-dt / PHASE_S)[:, None]
         before = stays * self.probabilities + (1 - stays) / len(SHARES)
         equations = estimator.centres(states, estimator.prepared(states, observations))

@@ -273,10 +273,11 @@ class Tracker:
         prediction, tracked = associated.prediction, associated.tracked
         given = AssignedFrames(prediction, tracked, detections, assignments)
         own = assignments.select(self.own.are_own(given, self.robust.noise_px2))
-        noisy = detections.with_noise(self.robust.added_px2)
-        prediction = self.motion.narrowed(
-            prediction, MatchedObservations.of(own, noisy, self.table.markers)
-        )
+        if self.robust.is_doubtful or self.own.displaced or self.monitors.rig.contradicting:
+            self.motion.restart()
+        else:
+            seen = MatchedObservations.of(own, detections, self.table.markers)
+            prediction = self.motion.narrowed(prediction, seen)
         fitted = self.robust.update(prediction, needed, detections, own)
         self.table.states = fitted.states
         self.rig_response.update(fitted)
