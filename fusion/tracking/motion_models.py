@@ -37,15 +37,19 @@ class MotionModels:
 
     Args:
         estimator: of the robots.
+
+    Attributes:
+        is_sudden: whether most robots of the last frame set began to accelerate at once: they did, or a camera moved.
     """
 
     def __init__(self, estimator: Estimator) -> None:
         self._estimator, n = estimator, len(estimator.single)
         self.probabilities = np.tile(SHARES == 1, (n, 1)).astype(float)
+        self.is_sudden = False
 
     def restart(self, rows: Index | slice = slice(None)) -> None:
         """Expect the declared motion of robots: of those that were acquired, or of all."""
-        self.probabilities[rows] = SHARES == 1
+        self.probabilities[rows], self.is_sudden = SHARES == 1, False
 
     def inherit(self, old: "MotionModels", same: Mapping[int, int]) -> None:
         """Continue with the robots of another one, whose rows `same` has by row."""
@@ -78,4 +82,6 @@ class MotionModels:
             before,
             SHARES,
         )
+        risen = (self.probabilities - before)[n_cameras > 1] @ np.log(SHARES)
+        self.is_sudden = bool(len(risen)) and bool(np.median(risen) > -np.log(SHARES[1]))
         return Prediction(replace(states, P=P), information, prediction.motion)

@@ -112,14 +112,22 @@ class RobustUpdate:
         self._residuals, self._left_out, self.added_px2 = ResidualMonitor(), None, 0.0
 
     def update(
-        self, prediction: Prediction, needed: Index, detections: DetectionTable, assignments: Assignments
+        self,
+        prediction: Prediction,
+        needed: Index,
+        detections: DetectionTable,
+        assignments: Assignments,
+        is_sudden: bool = False,
     ) -> RobustFit:
-        """The updated states, and the assignments that fit; `needed` as of `RobustFit`."""
+        """The updated states, and the assignments that fit; `needed` as of `RobustFit`, `is_sudden` as of
+        `MotionModels`: then a camera that explains it alone has moved, and the robots have not."""
         fitted = self._fit(prediction, needed, detections, assignments)
         if self.added_px2:
             self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
         if (again := self._left_out_again(fitted)) is not None:
             fitted = again
+        elif is_sudden and (without := self._leave_one_out(fitted)) is not None:
+            fitted = without
         elif not self._is_unusual(fitted):
             self._left_out = None
             if self.added_px2:

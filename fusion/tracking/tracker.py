@@ -278,7 +278,7 @@ class Tracker:
         else:
             seen = MatchedObservations.of(own, detections, self.table.markers)
             prediction = self.motion.narrowed(prediction, seen)
-        fitted = self.robust.update(prediction, needed, detections, own)
+        fitted = self.robust.update(prediction, needed, detections, own, self.motion.is_sudden)
         self.table.states = fitted.states
         self.rig_response.update(fitted)
         self._claim()
