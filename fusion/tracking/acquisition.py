@@ -29,8 +29,6 @@ from fusion.tracking.single_markers import (
 from fusion.tracking.track_table import TrackTable
 from fusion.tracking.trial_updates import Starts, refine
 
-MAX_BODIES = 300  # constellations searched for in one frame set; the others follow in the next ones
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Acquired:
@@ -66,7 +64,7 @@ class Acquisition:
 
     def __init__(self, cameras: CameraArray, estimator: Estimator) -> None:
         self._cameras, self._estimator = cameras, estimator
-        self._turn = 0  # row of the first constellation to search for, if there are too many
+        self._turn = 0  # row of the first constellation to decide about, if there are too many fits
         self._usual = 0.0  # misfit of tracked robots, when there were some last
         self.search, self._weak = MarkerSearch(cameras), WeakFits()
 
@@ -148,20 +146,16 @@ class Acquisition:
         if not len(missing):
             return [], {}
         self._usual = _usual_misfit(table, self._cameras, detections, assignments) or self._usual
-        turn = self._turn
-        rows = np.roll(missing, -int(np.searchsorted(missing, turn)))[:MAX_BODIES]
-        robots = {row: table.robots[row] for row in rows.tolist()}
+        robots = {row: table.robots[row] for row in missing.tolist()}
         scene = TriangulatedMarkers.of(markers, self._cameras)
         question = MissingConstellations(robots, scene, search(robots, scene))
         identified = identify(
             question,
             lambda fits: self._refine(table, Starts.of(fits, markers, table.markers), detections),
             self._usual,
-            turn,
+            self._turn,
         )
         self._turn = identified.turn
-        if self._turn == turn and len(rows) < len(missing):
-            self._turn = int(rows[-1]) + 1
         n_frame_sets, t_ns = self.search.n_frame_sets, table.t_ns or 0
         confirmed = self._weak.confirm(identified.weak, t_ns, n_frame_sets)
         found = [*identified.fits, *confirmed]
@@ -221,8 +215,6 @@ def _too_few(robot: Robot, scene: TriangulatedMarkers) -> str:
 def _reason(table: TrackTable, k: int, question: MissingConstellations, identified: Identified) -> str:
     """Why constellation k was not acquired."""
     n, found = len(table.robots[k].markers), question.candidates
-    if k not in question.robots:
-        return "waits for its turn"
     if k in found.crowded:
         return "too many unlabeled markers have its distances"
     if k in identified.rivals:

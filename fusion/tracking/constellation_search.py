@@ -2,6 +2,7 @@
 """Finds where the distances and the visibility of triangulated markers allow constellations to be."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -102,7 +103,7 @@ def search(robots: dict[int, Robot], scene: TriangulatedMarkers) -> Candidates:
     """Find all maximal mappings of three or more markers of robots, by row, with all distances within tolerance."""
     if len(scene) < MIN_MARKERS or not robots:
         return Candidates({}, frozenset())
-    reach_m = max(float(distances(robot.points).max()) for robot in robots.values())
+    reach_m = max(float(_shape(robot)[0].max()) for robot in robots.values())
     flat = not any(robot.normals for robot in robots.values())
     to_cameras = scene.to_cameras[:, :0] if flat else scene.to_cameras  # `fit` compares these too
     views = np.ascontiguousarray(to_cameras)
@@ -110,11 +111,16 @@ def search(robots: dict[int, Robot], scene: TriangulatedMarkers) -> Candidates:
     tables, crowded = {}, set()
     for row, robot in robots.items():
         usable = scene.with_diameter(robot.diameter_m)
-        shape = distances(robot.points), _angles(robot)
-        tables[row], complete = cloud.mappings(*shape, usable, MAX_STEPS, MAX_MAPPINGS)
+        tables[row], complete = cloud.mappings(*_shape(robot), usable, MAX_STEPS, MAX_MAPPINGS)
         if not complete:
             crowded.add(row)
     return Candidates(tables, frozenset(crowded))
+
+
+@lru_cache(512)  # twice the robots of an arena
+def _shape(robot: Robot) -> tuple[Array, Array]:
+    """(M, M) distances between the markers of a robot, and `_angles`."""
+    return distances(robot.points), _angles(robot)
 
 
 def _angles(robot: Robot) -> Array:

@@ -17,7 +17,7 @@ from fusion.model.limits import Limits
 from fusion.model.observations import CameraArray, DetectionTable
 from fusion.model.robots import Robot, require_distinct
 from fusion.server.frame_synchronizer import FrameSynchronizer
-from fusion.tracking import acquisition, identification, marker_search
+from fusion.tracking import identification, marker_search
 from fusion.tracking.constellation_search import SIGMAS, SLACK_M, Candidates, TriangulatedMarkers, search
 from fusion.tracking.gating import POSITION_GATE
 from fusion.tracking.marker_search import find_markers
@@ -195,16 +195,10 @@ def test_cold_starts_with_missing_frames_acquire_no_wrong_robot():
     assert acquired > 0.5 * 60 * load.robots
 
 
-@pytest.mark.parametrize(
-    "limit", ["MAX_COMPARED", pytest.param("MAX_BODIES", marks=pytest.mark.ci), "MAX_PAIRS"]
-)
+@pytest.mark.parametrize("limit", ["MAX_COMPARED", "MAX_PAIRS"])
 def test_limits_delay_the_acquisition_and_do_not_prevent_it(monkeypatch: pytest.MonkeyPatch, limit: str):
     """Each limit is a tenth of what the twelve robots need, or half of what they need among false detections."""
-    module, value = {
-        "MAX_COMPARED": (identification, 3),
-        "MAX_BODIES": (acquisition, 1),
-        "MAX_PAIRS": (marker_search, 1),
-    }[limit]
+    module, value = {"MAX_COMPARED": (identification, 3), "MAX_PAIRS": (marker_search, 1)}[limit]
     monkeypatch.setattr(module, limit, value)
     load = Load(12, 4, 6, 30.0, seed=5, false=60.0 if limit == "MAX_PAIRS" else 1.0)
     tracker = Tracker(load.rig, load.bodies)
