@@ -20,16 +20,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from camera_node.foundation.arrays import Index
+from camera_node.foundation.arrays import Array, Index
 from fusion import _core
 from fusion.model.observations import MatchedObservations, views
 from fusion.tracking.estimator import Estimator, Prediction
 
 # Of the declared density, as of accelerations of 10 m/s^2 (`aerial`), 2.2, 0.5 and 0.1 m/s^2, which is at rest.
 SHARES = np.array([1.0, 1 / 20, 1 / 400, 1 / 8000])
-PHASE_S = (
-    0.5  # mean duration of a phase of motion with one density, as of starting, driving evenly, or turning
-)
+PHASE_S = 0.5  # mean duration of a phase of motion with one density: of starting, driving evenly, or turning
+LEAST_OWN = 1e-3  # share of the variance of a detection that is its own
 
 
 class MotionModels:
@@ -69,7 +68,9 @@ class MotionModels:
         observations = observations.select(n_cameras[body] > 1)
         stays = np.exp(-dt / PHASE_S)[:, None]
         before = stays * self.probabilities + (1 - stays) / len(SHARES)
-        equations = estimator.centres(states, estimator.prepared(states, observations))
+        observations = estimator.prepared(states, observations)
+        equations = estimator.centres(states, observations)
+        equations[:, :, 12] *= self._precision(observations)[:, None]
         self.probabilities, P, information = _core.weigh_motions(
             states.bodies,
             states.P,
@@ -85,3 +86,10 @@ class MotionModels:
         risen = (self.probabilities - before)[n_cameras > 1] @ np.log(SHARES)
         self.is_sudden = bool(len(risen)) and bool(np.median(risen) > -np.log(SHARES[1]))
         return Prediction(replace(states, P=P), information, prediction.motion)
+
+    def _precision(self, observations: MatchedObservations) -> Array:
+        """(N,) standard deviations by which the filter weighs detections, over their own. The errors of cameras that it
+        counts as noise are the same in all frame sets: innovations are smaller, and motion shows earlier."""
+        seen = observations.detections
+        own = seen.variance_px2 - self._estimator.cameras.error_px[seen.camera] ** 2
+        return np.sqrt(seen.variance_px2 / np.maximum(own, LEAST_OWN * seen.variance_px2))
