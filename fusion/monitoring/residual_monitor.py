@@ -34,7 +34,12 @@ class ResidualMonitor:
     @property
     def slack_px(self) -> float:
         """Standard deviation that covers calibration errors: as the residuals show, `SLACK_PX` until they are known."""
-        return min(SLACK_PX, SLACK_RATIO * self._usual_px) if self._learned >= LEARNED else SLACK_PX
+        return min(SLACK_PX, SLACK_RATIO * self._usual_px) if self.is_known else SLACK_PX
+
+    @property
+    def is_known(self) -> bool:
+        """Whether enough frame sets were usual to define it."""
+        return self._learned >= LEARNED
 
     def is_unusual(self, cost: Array, count: Index) -> bool:
         """Whether most robots contradict their predictions by more than chance and more than usual.
@@ -44,7 +49,7 @@ class ResidualMonitor:
             count: (R,) of its detections.
         """
         n = 2 * int(count.sum())
-        if self._learned < LEARNED or not n:
+        if not self.is_known or not n:
             return False
         limit = max(float(chdtri(n, FALSE_ALARM)) / n, MIN_RATIO**2 * self._usual_cost)
         return bool(_mean_cost(cost, count) > limit)

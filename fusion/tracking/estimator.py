@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Mask
 from fusion import _core
-from fusion.model.observations import CameraArray, MatchedObservations, Views
+from fusion.model.observations import CameraArray, MatchedObservations, Views, mean_by_body
 from fusion.model.states import OMEGA, VELOCITY, States, Transition, predict, reset_unobservable
 from fusion.model.undistortion import COV, OUTLINE
 from fusion.tracking.gating import AXIS_SIGMA_PX
@@ -153,6 +153,14 @@ class Estimator:
         """The whitened derivatives (2 N, 12) of N centres by the errors of their bodies, and innovations (2 N,)."""
         equations = self.centres(states, observations)
         return equations[:, :, :12].reshape(-1, 12), equations[:, :, 12].ravel()
+
+    def motion_px2(self, states: States, observations: MatchedObservations) -> Array:
+        """(B,) mean square of a coordinate, px^2, by which the velocities of bodies displace their images between the
+        exposures of a frame set: cameras that are off by as much look the same. NaN without observations."""
+        body, tau, n = observations.discs.body, observations.detections.tau, len(states)
+        velocity = self._image_velocity(states, observations, self._views(states, observations))
+        moved = velocity * (tau - mean_by_body(tau, body, n)[body])
+        return mean_by_body((moved**2).sum(0) / 2, body, n)
 
     def squared_px(self, states: States, observations: MatchedObservations) -> Array:
         """(N,) squared distances of the centres from those expected, px^2; NaN where the disc is not visible."""

@@ -91,7 +91,8 @@ class RefinedFits:
 
     def select(self, rows: Mask) -> "RefinedFits":
         """The rows of a mask."""
-        used, number = rows[self.body], np.cumsum(rows) - 1
+        used = rows[self.body]
+        body = (np.cumsum(rows) - 1)[self.body[used]]
         return RefinedFits(
             self.robot[rows],
             self.states.select(rows),
@@ -102,8 +103,8 @@ class RefinedFits:
             self.explained[rows],
             self.shared[rows],
             self.assignments.select(used),
-            number[self.body[used]],
-            self.observations.select(used),
+            body,
+            self.observations.select(used).with_bodies(body),
             self.equations[used],
             self.weights[used],
         )

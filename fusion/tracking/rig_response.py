@@ -60,18 +60,19 @@ class RigResponse:
         """The errors of robots (rows) that start from a state of unknown origin follow none of the cameras."""
         self.responses[rows], self.counted[rows] = 0.0, 0.0
 
-    def restart(self, states: States, fits: RefinedFits) -> None:
+    def restart(self, states: States, fits: RefinedFits, added_px2: float) -> None:
         """Robots that were located without a prediction.
 
         Args:
             states: of all robots, with those of the fits.
             fits: of the robots.
+            added_px2: variance that the fits gave the detections beside their own noise.
         """
         self.forget(fits.robot)
         observations, n = fits.observations.with_bodies(fits.robot[fits.body]), len(states)
         at_rest = Transition(np.zeros((n, 3, 3)), np.zeros(n))
         unknown = np.zeros((n, 12, 12)), at_rest
-        self._follow(states, observations, (fits.equations, fits.weights), unknown, 0.0)
+        self._follow(states, observations, (fits.equations, fits.weights), unknown, added_px2)
 
     def _follow(
         self,

@@ -7,6 +7,9 @@ detections grows until the fits agree with the predictions: robots hold to these
 of a robot contradict the others, the view of one camera is left out that explains this, as one in which markers were
 taken for each other. Then detections are left out that contradict the others of their robot (joint compatibility).
 
+At the start nothing has confirmed the rig, and the first fit of a robot explains what cameras contradict by a velocity.
+Where this predicts most robots wrongly, they start again with noise.
+
 Association gates each detection alone: the prediction may be off by a centimetre, and the gates are as wide. But that
 error is common to all markers of a robot. Once some detections determine it, the others must lie within noise and
 calibration errors (joint compatibility: Neira and Tardos 2001). The one that the others contradict most is removed
@@ -17,6 +20,7 @@ since noise of 0.1 px makes all detections outliers of a prediction that is 1 px
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
@@ -25,11 +29,12 @@ from fusion.model.observations import (
     DetectionTable,
     MarkerTable,
     MatchedObservations,
+    count_checked,
     mean_by_body,
     views,
 )
-from fusion.model.states import POSITION, States
-from fusion.monitoring.residual_monitor import LEARNED, ResidualMonitor, camera_at_fault
+from fusion.model.states import POSITION, VELOCITY, States
+from fusion.monitoring.residual_monitor import FALSE_ALARM, LEARNED, ResidualMonitor, camera_at_fault
 from fusion.tracking.estimator import Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
 from fusion.tracking.labelings import are_unchecked
@@ -75,6 +80,18 @@ class RobustFit:
     contradicting: Array
     added_px2: float
 
+    def without(self, contradicted: Mask) -> "RobustFit":
+        """Robots (R,) that their detections contradict stay as predicted and lose them."""
+        rows, kept = np.flatnonzero(contradicted), ~contradicted[self.observations.discs.body]
+        return replace(
+            self,
+            states=self.states.with_rows(rows, self.prediction.states.select(rows)),
+            assignments=self.assignments.select(kept),
+            observations=self.observations.select(kept),
+            equations=self.equations[kept],
+            weights=self.weights[kept],
+        )
+
 
 class RobustUpdate:
     """Updates robots, and learns which residuals are usual.
@@ -91,11 +108,12 @@ class RobustUpdate:
         self._estimator, self._markers = estimator, markers
         self._residuals = ResidualMonitor()
         self._left_out: int | None = None  # the camera at fault in the last frame set
+        self._is_confirmed = False  # whether frame sets were usual since the start, so that the rig holds
         self.added_px2 = 0.0
 
     def inherit(self, old: "RobustUpdate") -> None:
         """Continue with the usual residuals of other robots."""
-        self._residuals = old._residuals
+        self._residuals, self._is_confirmed = old._residuals, old._is_confirmed
 
     @property
     def noise_px2(self) -> float:
@@ -106,6 +124,30 @@ class RobustUpdate:
     def is_doubtful(self) -> bool:
         """Whether the last frame set contradicted the predictions."""
         return self._left_out is not None or self.added_px2 > 0
+
+    def start(self, motion_px2: Array, n_predicted: int) -> float:
+        """Robots start; returns the variance of their detections beside their own noise. Until the rig is confirmed, it
+        is what velocities explain of the median robot: cameras that are off by as much look the same.
+
+        Args:
+            motion_px2: as of `Estimator.motion_px2`, of those that were acquired before, and not where they are now.
+            n_predicted: robots that are where they were predicted.
+        """
+        if len(motion_px2) and not self._is_confirmed:
+            median_px2 = np.median(np.concatenate([motion_px2, np.zeros(n_predicted)]))
+            self.added_px2 = max(self.added_px2, float(median_px2))
+        return self.added_px2
+
+    def refuted(self, fitted: RobustFit, tracked: Mask) -> Mask:
+        """(R,) tracked robots that are not where their velocities predicted, if these are most, before anything has
+        confirmed the rig: the frame set in which they started shows errors of cameras as velocities."""
+        if self._is_confirmed or self.added_px2:
+            return np.zeros_like(tracked)
+        before, v = fitted.prediction.states, fitted.states.v - fitted.prediction.states.v
+        gained = np.linalg.solve(before.P[:, VELOCITY, VELOCITY], v[:, :, None])[:, :, 0]
+        differs = np.einsum("ni,ni->n", v, gained) > chdtri(3, FALSE_ALARM)
+        refuted = tracked & (differs | (fitted.count == 0))
+        return refuted & (2 * refuted.sum() > tracked.sum())
 
     def settle(self) -> None:
         """The rig graph judged what the detections contradict: what is usual from now on is learnt."""
@@ -124,6 +166,9 @@ class RobustUpdate:
         fitted = self._fit(prediction, needed, detections, assignments)
         if self.added_px2:
             self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
+        self._is_confirmed |= self._residuals.is_known
+        if self.added_px2 and not self._is_confirmed:
+            self.added_px2 = max(self.added_px2, self._contradiction_px2(fitted))
         if (again := self._left_out_again(fitted)) is not None:
             fitted = again
         elif is_sudden and (without := self._leave_one_out(fitted)) is not None:
@@ -143,6 +188,15 @@ class RobustUpdate:
         """Less noise than detections have themselves changes nothing."""
         return float(fitted.detections.variance_px2.mean()) if len(fitted.detections) else 0.0
 
+    def _contradiction_px2(self, fitted: RobustFit) -> float:
+        """What velocities explain that the predictions do not have, of the median robot that two cameras see."""
+        before, after, of = fitted.prediction.states, fitted.states, fitted.observations
+        seen = np.flatnonzero(count_checked(of.discs.body, of.detections.camera, len(after)))
+        if not len(seen):
+            return 0.0
+        states = replace(after, omega=after.omega - before.omega, v=after.v - before.v)
+        return float(np.median(self._estimator.motion_px2(states, of)[seen]))
+
     def _is_unusual(self, fitted: RobustFit) -> bool:
         return self._residuals.is_unusual(fitted.cost, fitted.count)
 
@@ -160,33 +214,27 @@ class RobustUpdate:
         observations = MatchedObservations.of(assignments, noisy, self._markers)
         observations = self._estimator.prepared(prediction.states, observations)
         fitted = self._estimator.fit(prediction, observations)
-        states, fits = fitted.states, assignments.with_residuals(fitted.squared_px)
         body, n = observations.discs.body, len(prediction.states)
         is_large = observations.misfit(fitted.squared_px) > MAX_CHI2
         share = mean_by_body(is_large, body, n)
         contradicted = share > np.where(needed, 0.0, CONTRADICTED)
         contradicted |= are_unchecked(needed, body, observations.detections.camera)
-        rows, equations, weights = np.flatnonzero(contradicted), fitted.equations, fitted.weights
-        if len(rows):
-            states = states.with_rows(rows, prediction.states.select(rows))
-            kept = ~contradicted[body]
-            fits, observations = fits.select(kept), observations.select(kept)
-            equations, weights = equations[kept], weights[kept]
-        return RobustFit(
-            states=states,
-            assignments=fits,
+        fit = RobustFit(
+            states=fitted.states,
+            assignments=assignments.with_residuals(fitted.squared_px),
             prediction=prediction,
             needed=needed,
             detections=detections,
             given=assignments,
             observations=observations,
-            equations=equations,
-            weights=weights,
+            equations=fitted.equations,
+            weights=fitted.weights,
             cost=fitted.cost,
             count=np.bincount(body, minlength=n),
             contradicting=share,
             added_px2=added_px2,
         )
+        return fit.without(contradicted) if contradicted.any() else fit
 
     def _again(self, fitted: RobustFit, given: Assignments, added_px2: float = 0.0) -> RobustFit:
         """The fit of other assignments, or with another noise."""

@@ -151,6 +151,14 @@ class TrackTable:
         error = p - position
         return float(error @ np.linalg.solve(own + covariance, error))
 
+    def are_elsewhere(self, rows: Index, states: States) -> Mask:
+        """(K,) robots (rows) that were acquired before, and are not at these states now."""
+        elsewhere = [
+            self.status[k] is not None and self._differs(k, p, P)
+            for k, p, P in zip(rows.tolist(), states.p, states.P, strict=True)
+        ]
+        return np.array(elsewhere, bool)
+
     def is_local(self, k: int) -> bool:
         """Whether its start or its history says where robot k is."""
         if self.status[k] is None:

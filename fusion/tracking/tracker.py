@@ -24,6 +24,7 @@ from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import AssignedFrames, AssociatedFrames, Association, OwnDetections
 from fusion.tracking.claim_check import ClaimCheck
 from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.identification import RefinedFits
 from fusion.tracking.labelings import choose_labelings
 from fusion.tracking.motion_models import MotionModels
 from fusion.tracking.rays import Marker
@@ -39,6 +40,7 @@ from fusion.tracking.rig_response import RigResponse
 from fusion.tracking.robust_update import RobustFit, RobustUpdate
 from fusion.tracking.single_view import SingleViewTracker
 from fusion.tracking.track_table import TrackTable
+from fusion.tracking.trial_updates import with_noise
 from fusion.tracking.unlabeled import UnlabeledMarkers, UnlabeledTracker
 
 log = logging.getLogger("fusion")
@@ -156,7 +158,7 @@ class Tracker:
 
     def update(self, associated: AssociatedFrames, frame_set: FrameSet) -> Update:
         """Update the tracked robots with their detections."""
-        t_ns, tracked = frame_set.t_ns, associated.tracked
+        t_ns = frame_set.t_ns
         detections, all_assigned, labelings = associated.association.collect(self._used(frame_set))
         spread_s = float(np.ptp(detections.exposures.tau)) if len(detections.exposures.tau) else 0.0
         needed = self.table.needed_detections(associated.prediction.states, spread_s)
@@ -165,6 +167,7 @@ class Tracker:
         fitted = self._update_states(associated, needed, detections, all_assigned)
         assignments = fitted.assignments
         self.table.observe(t_ns, assignments)
+        tracked = associated.tracked & self.table.alive  # without those that `_update_states` lost
         summary = self._summarize(detections, assignments)
         final = tracked & ~(self.table.single & self._misses_bodies(tracked))
         poses = robot_poses(self.table, self.cameras, t_ns, summary, np.flatnonzero(final).tolist())
@@ -279,6 +282,10 @@ class Tracker:
             seen = MatchedObservations.of(own, detections, self.table.markers)
             prediction = self.motion.narrowed(prediction, seen)
         fitted = self.robust.update(prediction, needed, detections, own, self.motion.is_sudden)
+        refuted = self.robust.refuted(fitted, tracked & self.table.searched)
+        if refuted.any():
+            fitted = fitted.without(refuted)
+            self.table.lose(np.flatnonzero(refuted))
         self.table.states = fitted.states
         self.rig_response.update(fitted)
         self._claim()
@@ -292,19 +299,32 @@ class Tracker:
             self.table, missing, update.detections, update.assignments, histories
         )
         self._reasons = found.reasons
-        for fits in found.fits:
-            self.table.adopt(fits.robot, fits.states)
-            self.motion.restart(fits.robot)
-            self.rig_response.restart(self.table.states, fits)
+        self._start(found.fits)
         self.table.lose(found.displaced)
-        if found.fits:
-            self._claim()
         if len(found.assignments) != len(update.assignments):
             self.table.observe(update.t_ns, found.assignments)
         if not len(missing):
             return update, found
         summary = self._summarize(update.detections, found.assignments)
         return replace(update, assignments=found.assignments, summary=summary), found
+
+    def _start(self, found: tuple[RefinedFits, ...]) -> None:
+        """Track the robots that were acquired."""
+        if not found:
+            return
+        motion_px2 = [
+            self.estimator.select(fits.robot).motion_px2(fits.states, fits.observations)[
+                self.table.are_elsewhere(fits.robot, fits.states)
+            ]
+            for fits in found
+        ]
+        added_px2 = self.robust.start(np.concatenate(motion_px2), int(self.table.located.sum()))
+        for fits in found:
+            start = with_noise(self.estimator, fits, added_px2)
+            self.table.adopt(start.robot, start.states)
+            self.motion.restart(start.robot)
+            self.rig_response.restart(self.table.states, start, added_px2)
+        self._claim()
 
     def _track_unlabeled(self, update: Update, markers: list[Marker]) -> UnlabeledMarkers:
         """Track the remaining markers, and those that only one camera sees."""

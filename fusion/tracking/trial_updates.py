@@ -204,6 +204,23 @@ def refine(
     )
 
 
+def with_noise(estimator: Estimator, fits: RefinedFits, added_px2: float) -> RefinedFits:
+    """The fits with a variance, px^2, added to their detections: what contradicts may be velocities, or cameras."""
+    if not added_px2:
+        return fits
+    estimator = estimator.select(fits.robot)
+    starts = States.at_rest(fits.states.R, fits.states.p, START_SIGMAS)
+    if estimator.single.any():
+        single = States.at_rest(fits.states.R, fits.states.p, START_SIGMAS_SINGLE)
+        starts = starts.with_rows(estimator.single, single.select(estimator.single))
+    seen = fits.observations
+    observations = MatchedObservations.of_discs(seen.detections.with_noise(added_px2), seen.discs)
+    fit = estimator.fit(estimator.predict(starts, np.full(len(starts), START_S)), observations, SMALL)
+    return replace(
+        fits, states=fit.states, observations=observations, equations=fit.equations, weights=fit.weights
+    )
+
+
 def _assigned(markers: list[Marker], rows: Index) -> tuple[Assignments, Index]:
     """The detections of triangulated markers, assigned to `rows` of the marker table; and the marker of each."""
     detections = [np.empty(0, np.intp), *(marker.detections for marker in markers)]

@@ -258,18 +258,20 @@ def test_the_noise_of_stamps_is_noise_along_the_motion():
     """Stamps with uniform errors of up to 10 ms displace detections of a robot at 0.9 m/s by up to 9 mm, 2 px.
 
     Squared errors by covariance have the mean 1 at most: velocities may change suddenly, so their covariance is wide,
-    and on a straight line they do not. With exact times assumed the mean is far above.
+    and on a straight line they do not. With exact times assumed the mean is far above. The first 16 frame sets are
+    exact: a rig that errors of stamps contradict from the start claims less.
     """
     arena = Arena({"a": TRIANGLE}, {"a": line((-0.9, 0.2, 0.2), (0.9, -0.2, 0.0))}, sigma_px=0.05)
     random, bound_s = np.random.default_rng(5), 0.01
     error_ns = np.round(random.uniform(-bound_s, bound_s, 240) * 1e9).astype(int).tolist()
+    error_ns[:64] = [0] * 64
     honesty = []
     for sigma_s in (bound_s / np.sqrt(3), 0.0):
         frames = [
             replace(frame, t_ns=frame.t_ns + error, clock_sigma_s=sigma_s)
             for frame, error in zip(arena.frames(60), error_ns, strict=True)
         ]
-        poses = [pose for pose in poses_of(track(arena, frames), "a")[15:] if pose.state == "tracked"]
+        poses = [pose for pose in poses_of(track(arena, frames), "a")[20:] if pose.state == "tracked"]
         assert len(poses) > 30
         P = np.array([np.frombuffer(p.covariance, "<f4").reshape(12, 12)[3:6, 3:6] for p in poses], float)
         e = errors(arena, poses)[:, 3:]
