@@ -241,16 +241,18 @@ def weigh_motions(
     single: NDArray[np.bool_],
     equations: Array,
     body: Index,
+    camera: Index,
+    precision: Array,
     before: Array,
     shares: Array,
     /,
-) -> tuple[Array, Array, Array]:
-    """Probabilities (B, K) of K models given the observations of a frame set, and P and information (B, 12, 12) by the
-    geometric mean of their densities; those of bodies without observations do not change.
+) -> tuple[Array, Array, Array, Index]:
+    """Probabilities (B, 4) of models given the observations of a frame set, P and information (B, 12, 12) by the
+    geometric mean of their densities, and the rows of the bodies that two cameras observe; the others do not change.
 
     B predicted bodies: their P, its inverse, dt (B,), densities (B, 2) and single (B,) as of `predict`. equations (N,
-    2, 13) of centres and their body (N,); before (B, K) probabilities; shares (K,) of the densities: see
-    `native/motion_models.hpp`.
+    2, 13) of centres, their body and camera (N,), and their standard deviations (N,) as weighed over their own; before
+    (B, 4) probabilities; shares (4,) of the densities: see `native/motion_models.hpp`.
     """
 
 def eliminate_robots(

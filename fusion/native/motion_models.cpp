@@ -20,11 +20,12 @@ struct ReducedObservations {
     ErrorVector z{};
 };
 
-ROUNDEL_CLONES void add(const Equations& equations, ErrorMatrix& H, ErrorVector& g) {
+/// Adds equations whose right sides are times `precision`.
+ROUNDEL_CLONES void add(const Equations& equations, double precision, ErrorMatrix& H, ErrorVector& g) {
     for (const auto& row : equations.A)
         for (int i = 0; i < kErrors; ++i) {
             for (int j = 0; j < kErrors; ++j) H[i][j] += row[i] * row[j];
-            g[i] += row[i] * row[kErrors];
+            g[i] += row[i] * (precision * row[kErrors]);
         }
 }
 
@@ -99,17 +100,20 @@ void weigh(const ModelNumbers& costs, double* probabilities) {
 
 }  // namespace
 
-void weigh_motions(const PredictedBodies& predicted, const ModelNumbers& shares, double* probabilities,
-                   ErrorMatrix* P, ErrorMatrix* information) {
+std::vector<size_t> weigh_motions(const PredictedBodies& predicted, const ModelNumbers& shares,
+                                  double* probabilities, ErrorMatrix* P, ErrorMatrix* information) {
     const ByBody of(predicted.observed);
+    std::vector<size_t> weighed;
     ModelNumbers less, costs;  // of the declared densities, all of which are in P
     for (int m = 0; m < kModels; ++m) less[m] = shares[m] - 1;
     for (size_t b = 0; b < predicted.observed.n_bodies; ++b) {
-        if (of.first[b] == of.first[b + 1]) continue;
+        const size_t *begin = of.indices.data() + of.first[b], *end = of.indices.data() + of.first[b + 1];
+        const auto is_of_another = [&](size_t k) { return predicted.camera[k] != predicted.camera[*begin]; };
+        if (std::none_of(begin, end, is_of_another)) continue;
         ErrorMatrix H{};
         ErrorVector g{};
-        for (size_t at = of.first[b]; at < of.first[b + 1]; ++at)
-            add(predicted.observed.equations[of.indices[at]], H, g);
+        for (const size_t* k = begin; k < end; ++k)
+            add(predicted.observed.equations[*k], predicted.precision[*k], H, g);
         const auto [G, z] = reduce(H, g);
         const ErrorMatrix noise = process_noise(predicted.bodies[b], predicted.intervals[b]);
         ErrorMatrix S = congruent(G, predicted.P[b]);
@@ -123,7 +127,9 @@ void weigh_motions(const PredictedBodies& predicted, const ModelNumbers& shares,
         for (int m = 0; m < kModels; ++m) mean += of_body[m] * std::log(shares[m]);
         P[b] = sum(predicted.P[b], std::exp(mean) - 1, noise);
         information[b] = inverse(P[b]);
+        weighed.push_back(b);
     }
+    return weighed;
 }
 
 }  // namespace roundel::fusion

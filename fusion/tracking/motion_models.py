@@ -22,7 +22,7 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
 from fusion import _core
-from fusion.model.observations import MatchedObservations, views
+from fusion.model.observations import MatchedObservations
 from fusion.tracking.estimator import Estimator, Prediction
 
 # Of the declared density, as of accelerations of 10 m/s^2 (`aerial`), 2.2, 0.5 and 0.1 m/s^2, which is at rest.
@@ -63,33 +63,31 @@ class MotionModels:
             observations: of a frame set that does not contradict the rig: else innovations show no motion.
         """
         estimator, states, dt = self._estimator, prediction.states, prediction.motion.dt
-        body, camera = observations.discs.body, observations.detections.camera
-        n_cameras = views(body, camera, len(states)).sum(1)
-        observations = observations.select(n_cameras[body] > 1)
         stays = np.exp(-dt / PHASE_S)[:, None]
         before = stays * self.probabilities + (1 - stays) / len(SHARES)
         observations = estimator.prepared(states, observations)
-        equations = estimator.centres(states, observations)
-        equations[:, :, 12] *= self._precision(observations)[:, None]
-        self.probabilities, P, information = _core.weigh_motions(
+        self.probabilities, P, information, rows = _core.weigh_motions(
             states.bodies,
             states.P,
             prediction.information,
             dt,
             estimator.densities,
             estimator.single,
-            equations,
+            estimator.centres(states, observations),
             observations.discs.body,
+            observations.detections.camera,
+            self._precision(observations),
             before,
             SHARES,
         )
-        risen = (self.probabilities - before)[n_cameras > 1] @ np.log(SHARES)
-        self.is_sudden = bool(len(risen)) and bool(np.median(risen) > -np.log(SHARES[1]))
+        risen = (self.probabilities[rows] - before[rows]) @ np.log(SHARES)
+        self.is_sudden = bool(len(rows)) and bool(np.median(risen) > -np.log(SHARES[1]))
         return Prediction(replace(states, P=P), information, prediction.motion)
 
     def _precision(self, observations: MatchedObservations) -> Array:
         """(N,) standard deviations by which the filter weighs detections, over their own. The errors of cameras that it
         counts as noise are the same in all frame sets: innovations are smaller, and motion shows earlier."""
         seen = observations.detections
-        own = seen.variance_px2 - self._estimator.cameras.error_px[seen.camera] ** 2
-        return np.sqrt(seen.variance_px2 / np.maximum(own, LEAST_OWN * seen.variance_px2))
+        variance_px2 = seen.variance_px2
+        own = 1 - self._estimator.cameras.error_px[seen.camera] ** 2 / variance_px2
+        return 1 / np.sqrt(np.maximum(own, LEAST_OWN))

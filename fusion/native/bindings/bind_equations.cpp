@@ -103,12 +103,13 @@ auto predict_bodies(const BodyStates& bodies, const Covariances& P, const Number
 
 auto weigh_motions_of(const BodyStates& bodies, const Covariances& P, const Covariances& information,
                       const Numbers& dt, const In<double, -1, 2>& densities, const Mask& single,
-                      const EquationArray& equations, const Index& body,
-                      const In<double, -1, kModels>& before, const In<double, kModels>& shares) {
-    const size_t n = bodies.size(), n_models = shares.size();
+                      const EquationArray& equations, const Index& body, const Index& camera,
+                      const Numbers& precision, const In<double, -1, kModels>& before,
+                      const In<double, kModels>& shares) {
+    const size_t n = bodies.size();
     require_equal(
         n, {P.shape(0), information.shape(0), dt.size(), densities.shape(0), single.size(), before.shape(0)});
-    require_equal(body.size(), {equations.shape(0)});
+    require_equal(body.size(), {equations.shape(0), camera.size(), precision.size()});
     std::vector<MotionInterval> intervals;
     for (size_t b = 0; b < n; ++b) intervals.push_back({dt(b), densities(b, 0), densities(b, 1), single(b)});
     auto [probabilities, to_probabilities] = make({n, kModels});
@@ -121,14 +122,19 @@ auto weigh_motions_of(const BodyStates& bodies, const Covariances& P, const Cova
         bodies.data(),
         reinterpret_cast<const ErrorMatrix*>(P.data()),
         intervals.data(),
-        {reinterpret_cast<const Equations*>(equations.data()), below(n, body), body.size(), n}};
+        {reinterpret_cast<const Equations*>(equations.data()), below(n, body), body.size(), n},
+        camera.data(),
+        precision.data()};
     ModelNumbers of_declared;
     std::copy_n(shares.data(), kModels, of_declared.begin());
+    std::vector<size_t> weighed;
     unlocked([&, of_bodies = to_probabilities, out = to_P, inverted = to_information] {
-        weigh_motions(predicted, of_declared, of_bodies, reinterpret_cast<ErrorMatrix*>(out),
-                      reinterpret_cast<ErrorMatrix*>(inverted));
+        weighed = weigh_motions(predicted, of_declared, of_bodies, reinterpret_cast<ErrorMatrix*>(out),
+                                reinterpret_cast<ErrorMatrix*>(inverted));
     });
-    return std::make_tuple(probabilities, P_seen, information_seen);
+    auto [rows, to_rows] = make<int64_t>({weighed.size()});
+    std::copy(weighed.begin(), weighed.end(), to_rows);
+    return std::make_tuple(probabilities, P_seen, information_seen, rows);
 }
 
 }  // namespace
