@@ -59,7 +59,9 @@ def accuracy(load: Load, seconds: float) -> Accuracy:
         honesty.append(_mahalanobis(tracker.table.states.R, truth.R, error, tracker.table.claimed)[alive])
     rms = [1e3 * float(np.sqrt(np.mean(np.concatenate(x)))) for x in (mine, theirs, variance)]
     return Accuracy(
-        *rms,
+        rms[0],
+        rms[1],
+        rms[2],
         float(np.mean(np.concatenate(honesty)) / 6),
         float(np.mean(tracked)),
         1e3 * float(np.sqrt(np.mean(np.concatenate(velocity)))),

@@ -26,8 +26,8 @@ auto are_own(const In<double, -1, 2, 12>& A, const In<double, -1, 2>& nu, const 
     const size_t n = body.size(), n_asked = of_body.size();
     require_equal(n, {A.shape(0), nu.shape(0), log_density.size(), camera.size(), certain.size()});
     require_equal(n_asked, {of_camera.size(), turn.size(), prior.size(), added_px2.size()});
-    const Evidence evidence{reinterpret_cast<const double(*)[2][kErrors]>(A.data()),
-                            reinterpret_cast<const double(*)[2]>(nu.data()),
+    const Evidence evidence{reinterpret_cast<const double (*)[2][kErrors]>(A.data()),
+                            reinterpret_cast<const double (*)[2]>(nu.data()),
                             columns<4>(cov, n),
                             log_density.data(),
                             body.data(),

@@ -40,7 +40,7 @@ class Starting(Load):
     """Robots that start with 10 m/s^2, as `aerial` declares."""
 
     @cached_property
-    def paths(self) -> _Start:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def paths(self) -> _Start:  # pyright: ignore[reportIncompatibleVariableOverride]
         return _Start(super().paths)
 
 
