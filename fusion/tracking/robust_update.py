@@ -146,7 +146,9 @@ class RobustUpdate:
         before, v = fitted.prediction.states, fitted.states.v - fitted.prediction.states.v
         gained = np.linalg.solve(before.P[:, VELOCITY, VELOCITY], v[:, :, None])[:, :, 0]
         differs = np.einsum("ni,ni->n", v, gained) > chdtri(3, FALSE_ALARM)
-        refuted = tracked & (differs | (fitted.count == 0))
+        cameras = fitted.detections.exposures.camera  # without frames of all, robots may only be unseen
+        is_whole = len(np.unique(cameras)) == len(self._estimator.cameras.names)
+        refuted = tracked & (differs | ((fitted.count == 0) & is_whole))
         return refuted & (2 * refuted.sum() > tracked.sum())
 
     def settle(self) -> None:
