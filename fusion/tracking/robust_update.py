@@ -102,18 +102,19 @@ class RobustUpdate:
 
     Attributes:
         added_px2: variance that detections have beside their own noise while nothing explains what they contradict.
+        is_confirmed: whether frame sets were usual since the start, so that the rig holds.
     """
 
     def __init__(self, estimator: Estimator, markers: MarkerTable) -> None:
         self._estimator, self._markers = estimator, markers
         self._residuals = ResidualMonitor()
         self._left_out: int | None = None  # the camera at fault in the last frame set
-        self._is_confirmed = False  # whether frame sets were usual since the start, so that the rig holds
+        self.is_confirmed = False
         self.added_px2 = 0.0
 
     def inherit(self, old: "RobustUpdate") -> None:
         """Continue with the usual residuals of other robots."""
-        self._residuals, self._is_confirmed = old._residuals, old._is_confirmed
+        self._residuals, self.is_confirmed = old._residuals, old.is_confirmed
 
     @property
     def noise_px2(self) -> float:
@@ -125,23 +126,22 @@ class RobustUpdate:
         """Whether the last frame set contradicted the predictions."""
         return self._left_out is not None or self.added_px2 > 0
 
-    def start(self, motion_px2: Array, n_predicted: int) -> float:
-        """Robots start; returns the variance of their detections beside their own noise. Until the rig is confirmed, it
-        is what velocities explain of the median robot: cameras that are off by as much look the same.
+    def start(self, motion_px2: Array, n_predicted: int) -> None:
+        """Robots start before the rig is confirmed. Their detections have the variance beside their own noise that
+        velocities explain of the median robot: cameras that are off by as much look the same.
 
         Args:
             motion_px2: as of `Estimator.motion_px2`, of those that were acquired before, and not where they are now.
             n_predicted: robots that are where they were predicted.
         """
-        if len(motion_px2) and not self._is_confirmed:
+        if len(motion_px2):
             median_px2 = np.median(np.concatenate([motion_px2, np.zeros(n_predicted)]))
             self.added_px2 = max(self.added_px2, float(median_px2))
-        return self.added_px2
 
     def refuted(self, fitted: RobustFit, tracked: Mask) -> Mask:
         """(R,) tracked robots that are not where their velocities predicted, if these are most, before anything has
         confirmed the rig: the frame set in which they started shows errors of cameras as velocities."""
-        if self._is_confirmed or self.added_px2:
+        if self.is_confirmed or self.added_px2:
             return np.zeros_like(tracked)
         before, v = fitted.prediction.states, fitted.states.v - fitted.prediction.states.v
         gained = np.linalg.solve(before.P[:, VELOCITY, VELOCITY], v[:, :, None])[:, :, 0]
@@ -161,28 +161,29 @@ class RobustUpdate:
         needed: Index,
         detections: DetectionTable,
         assignments: Assignments,
-        is_sudden: bool = False,
+        is_sudden: bool,
     ) -> RobustFit:
         """The updated states, and the assignments that fit; `needed` as of `RobustFit`, `is_sudden` as of
         `MotionModels`: then a camera that explains it alone has moved, and the robots have not."""
         fitted = self._fit(prediction, needed, detections, assignments)
         if self.added_px2:
             self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
-        self._is_confirmed |= self._residuals.is_known
-        if self.added_px2 and not self._is_confirmed:
+        self.is_confirmed |= self._residuals.is_known
+        if self.added_px2 and not self.is_confirmed:
             self.added_px2 = max(self.added_px2, self._contradiction_px2(fitted))
+        is_unusual = self._is_unusual(fitted)
         if (again := self._left_out_again(fitted)) is not None:
             fitted = again
-        elif is_sudden and (without := self._leave_one_out(fitted)) is not None:
+        elif (is_unusual or is_sudden) and (without := self._leave_one_out(fitted)) is not None:
             fitted = without
-        elif not self._is_unusual(fitted):
+        elif is_unusual:
+            fitted = self._with_noise(fitted)
+        else:
             self._left_out = None
             if self.added_px2:
                 fitted = self._again(fitted, fitted.given, self.added_px2)
             else:
                 self._residuals.learn(fitted.assignments.squared_px, fitted.cost, fitted.count)
-        else:
-            fitted = self._leave_one_out(fitted) or self._with_noise(fitted)
         return self._without_incompatible(self._without_wrong_views(fitted))
 
     @staticmethod

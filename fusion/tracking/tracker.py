@@ -312,13 +312,15 @@ class Tracker:
         """Track the robots that were acquired."""
         if not found:
             return
-        motion_px2 = [
-            self.estimator.select(fits.robot).motion_px2(fits.states, fits.observations)[
-                self.table.are_elsewhere(fits.robot, fits.states)
+        if not self.robust.is_confirmed:
+            motion_px2 = [
+                self.estimator.select(fits.robot).motion_px2(fits.states, fits.observations)[
+                    self.table.are_elsewhere(fits.robot, fits.states)
+                ]
+                for fits in found
             ]
-            for fits in found
-        ]
-        added_px2 = self.robust.start(np.concatenate(motion_px2), int(self.table.located.sum()))
+            self.robust.start(np.concatenate(motion_px2), int(self.table.located.sum()))
+        added_px2 = self.robust.added_px2
         for fits in found:
             start = with_noise(self.estimator, fits, added_px2)
             self.table.adopt(start.robot, start.states)
