@@ -11,26 +11,39 @@ recording does not determine are named, with the interval that is claimed. The c
 - "lenses": four cameras before a wand, lenses unknown by factors between 1/2 and 2; of each recording two starts. Four
   recordings for one of the other cases: three have clocks of 0.1 to 0.3 by chance, and other three of 2 to 5.
 
-Options: `--seeds N` recordings of each case (3, and 12), `--jobs N` processes (1), `--cases NAME ...`.
+Options: `--seeds N` recordings of each case (3, and 12), `--jobs N` processes (1), `--cases NAME ...`, and `--layout
+caliscope | argus | dltdv`: each recording is written as that program writes it and imported.
 """
 
 import argparse
+import contextlib
+import io
+import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import msgspec
 import numpy as np
 from rich.console import Console
 
+from calib.commands.formats import FormatName, ImportData
 from calib.errors import CalibrationError
 from calib.rig.camera import DRIFT, OFFSET
+from calib.rig.rig import Rig, load_rig
 from calib.wand.bundle_adjustment.covariance import camera_covariance
 from calib.wand.calibrate import calibrate
 from calib.wand.quality.grade import assess
 from calib.wand.quality.lenses import describe_open_lenses
 from calib.wand.wand_report import WandCalibration
+from camera_node.foundation.errors import ConfigError
 from camera_node.foundation.terminal import track
+from camera_node.geometry.body import Body
+from camera_node.protocol.messages import Detections
+from camera_node.sources.recorded_detections import read_observations
 from tests.benchmarks.calibration_honesty import (
     FIGURES,
     LIGHT,
@@ -42,6 +55,7 @@ from tests.benchmarks.calibration_honesty import (
     without_lenses,
 )
 from tests.calib.cube import CUBE, one_after_the_other, wave
+from tests.calib.foreign_layouts import LAYOUTS
 from tests.calib.recordings import EPOCH_S, WandScenario, record, with_clocks
 from tests.calib.synthetic import CAREFUL, EXACT, WAND, ring, roughly
 
@@ -51,19 +65,58 @@ MIDDLE_NS = round(1e9 * (EPOCH_S + SECONDS / 2))
 MAX_OFFSET_S, MAX_RATE = 60.0, 0.01
 
 
-def cube(seed: int) -> Outcome:
+@dataclass(frozen=True)
+class Recorded:
+    """A recording, the rig before it, whose lenses may be guesses, and the truth, with the offset, s, and the rate of
+    each camera's clock where these are judged."""
+
+    rig: Rig
+    wand: Body
+    messages: Sequence[Detections]
+    truth: Rig
+    synchronous: bool = False
+    clocks: Mapping[str, tuple[float, float]] | None = None
+    guessed: bool = False
+
+    def through(self, layout: FormatName) -> "Recorded":
+        """The same, written as another program writes it and imported; its user guesses lenses again, others have no
+        standard deviations in these layouts.
+
+        Raises:
+            CalibrationError: the layout has no times, and the cameras run freely.
+        """
+        if layout != "caliscope" and not self.synchronous:
+            raise CalibrationError(f"{layout} has no times")
+        with tempfile.TemporaryDirectory() as name, contextlib.redirect_stdout(io.StringIO()):
+            folder = Path(name)
+            LAYOUTS[layout](folder, self.rig, self.wand, self.messages)
+            files = (folder,) if layout == "caliscope" else (folder / "profile.txt", folder / "xypts.csv")
+            ImportData(format=layout, files=files, out=folder).run()
+            rig = load_rig(folder / "rig.yaml")
+            sizes = {camera: (lens.width, lens.height) for camera, lens in rig.cameras.items()}
+            messages = read_observations(folder / "observations.csv", sizes, fps=RATE_HZ)
+        named = dict(zip(self.rig.cameras, rig.cameras, strict=True))
+        return replace(
+            self,
+            rig=Rig(cameras={named[k]: c for k, c in self.rig.cameras.items()}) if self.guessed else rig,
+            messages=messages,
+            truth=Rig(cameras={named[k]: camera for k, camera in self.truth.cameras.items()}),
+            clocks=self.clocks and {named[k]: clock for k, clock in self.clocks.items()},
+        )
+
+
+def cube(seed: int) -> Recorded:
     """Forty simultaneous frames."""
     arena = ring(8, wand=CUBE)
     rig = roughly(arena.intrinsics, CAREFUL, with_sigma=True, seed=seed)
-    result = calibrate(rig, CUBE, wave(arena, 2, 40, seed), synchronous=True)
-    return judge("cube", seed, result, arena.truth)
+    return Recorded(rig, CUBE, wave(arena, 2, 40, seed), arena.truth, synchronous=True)
 
 
-def groups(seed: int) -> Outcome:
+def groups(seed: int) -> Recorded:
     """Two hundred frames of each camera, which run freely."""
     arena, messages = one_after_the_other((2, 2), 200, seed)
     rig = roughly(arena.intrinsics, CAREFUL, with_sigma=True, seed=seed)
-    return judge("groups", seed, calibrate(rig, CUBE, messages), arena.truth)
+    return Recorded(rig, CUBE, messages, arena.truth)
 
 
 def scenario(seed: int, **options: object) -> WandScenario:
@@ -73,7 +126,7 @@ def scenario(seed: int, **options: object) -> WandScenario:
     return WandScenario(**{**header, **seen, "seed": seed, **options})
 
 
-def phones(seed: int) -> Outcome:
+def phones(seed: int) -> Recorded:
     """Each clock has an offset and a rate; one is right."""
     recorded = record(scenario(seed, cameras=6, wand=LIGHT, offset_ms=0.0))
     names, rng = list(recorded.truth.cameras), np.random.default_rng([13, seed])
@@ -81,12 +134,19 @@ def phones(seed: int) -> Outcome:
     drawn[0] = 0.0
     clocks = dict(zip(names, drawn.tolist(), strict=True))
     rig = roughly(recorded.intrinsics, EXACT, with_sigma=True)  # a light determines no lenses
-    result = calibrate(rig, LIGHT, with_clocks(recorded.messages, MIDDLE_NS, clocks))
-    outcome = judge("phones", seed, result, recorded.truth)
-    return msgspec.structs.replace(outcome, clocks=map_error(result, clocks), focal=None)
+    return Recorded(
+        rig, LIGHT, with_clocks(recorded.messages, MIDDLE_NS, clocks), recorded.truth, clocks=clocks
+    )
 
 
-def map_error(result: WandCalibration, clocks: dict[str, tuple[float, float]]) -> float:
+def lenses(seed: int) -> Recorded:
+    """Focal lengths start from another random factor in each camera."""
+    recorded = record(scenario(seed // STARTS, cameras=4, offset_ms=50.0))
+    rig = without_lenses(recorded.intrinsics, seed)
+    return Recorded(rig, WAND, recorded.messages, recorded.truth, guessed=True)
+
+
+def map_error(result: WandCalibration, clocks: Mapping[str, tuple[float, float]]) -> float:
     """Squared Mahalanobis error of all offsets and rates, over its degrees of freedom; a common offset and a common
     rate are not observable.
 
@@ -107,15 +167,7 @@ def map_error(result: WandCalibration, clocks: dict[str, tuple[float, float]]) -
     return error_of_differences(np.ravel(late), covariance.reshape(2 * len(late), -1), common)
 
 
-def lenses(seed: int) -> Outcome:
-    """Focal lengths start from another random factor in each camera."""
-    recorded = record(scenario(seed // STARTS, cameras=4, offset_ms=50.0))
-    result = calibrate(without_lenses(recorded.intrinsics, seed), WAND, recorded.messages)
-    outcome = judge("lenses", seed, result, recorded.truth)
-    return msgspec.structs.replace(outcome, fault=describe_open_lenses(assess(result, WAND).open_lenses))
-
-
-CASES: dict[str, Callable[[int], Outcome]] = {
+CASES: dict[str, Callable[[int], Recorded]] = {
     "cube": cube,
     "groups": groups,
     "phones": phones,
@@ -123,12 +175,19 @@ CASES: dict[str, Callable[[int], Outcome]] = {
 }
 
 
-def measure(case: str, seed: int) -> Outcome:
-    """The outcome of a case with a seed, or why it was refused."""
+def measure(case: str, seed: int, layout: FormatName | None = None) -> Outcome:
+    """The outcome of a case with a seed, or why it was refused; through the files of a layout if that is given."""
     try:
-        return CASES[case](seed)
-    except CalibrationError as error:
+        given = CASES[case](seed)
+        given = given.through(layout) if layout else given
+        result = calibrate(given.rig, given.wand, given.messages, synchronous=given.synchronous)
+    except (CalibrationError, ConfigError) as error:
         return Outcome(case, seed, fault=str(error))
+    outcome = judge(case, seed, result, given.truth)
+    if given.clocks is not None:
+        outcome = msgspec.structs.replace(outcome, clocks=map_error(result, given.clocks), focal=None)
+    fault = describe_open_lenses(assess(result, given.wand).open_lenses) if case == "lenses" else ""
+    return msgspec.structs.replace(outcome, fault=fault)
 
 
 def of_recordings(outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -152,11 +211,16 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
+    parser.add_argument("--layout", choices=LAYOUTS)
     options = parser.parse_args(arguments)
     options.cases.sort(key=list(CASES).index)
     start = time.monotonic()
     count = {case: options.seeds * (STARTS * RECORDINGS if case == "lenses" else 1) for case in options.cases}
     tasks = [(case, seed) for case, seeds in count.items() for seed in range(seeds)]
-    outcomes = list(track(compute(measure, tasks, options.jobs), "calibrating", len(tasks)))
+    outcomes = list(
+        track(
+            compute(partial(measure, layout=options.layout), tasks, options.jobs), "calibrating", len(tasks)
+        )
+    )
     report(of_recordings(sorted(outcomes, key=lambda outcome: tasks.index((outcome.cell, outcome.seed)))))
     Console().print(f"{len(tasks)} calibrations in {time.monotonic() - start:.0f} s")

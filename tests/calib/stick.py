@@ -5,28 +5,28 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.commands.formats import FORMATS, FormatName
+from calib.commands.formats import FormatName
+from calib.rig.wand_file import WandBody
+from camera_node.detection.roundels import Roundels
+from camera_node.protocol.messages import Detections
+from tests.calib.foreign_layouts import write_clicks
 from tests.calib.synthetic import ring
 
-LENGTH_M = 0.5
+LENGTH_M, SIGMA_PX = 0.5, 0.2
+STICK = WandBody(markers=((0, 0, 0), (LENGTH_M, 0, 0)))
 
 
 def write_stick(folder: Path, name: FormatName, table: str = "xypts.csv") -> None:
-    """Write `profile.txt` and the table: 60 places, 0.2 px of noise, pixels counted from 1, NaN where out of view."""
-    truth, rng = ring(3).truth, np.random.default_rng(1)
-    rows = []
-    for _ in range(60):
+    """Write `profile.txt` and the table of 60 places of the stick."""
+    arena, rng, messages = ring(3), np.random.default_rng(1), []
+    for seq in range(60):
         at, along = rng.uniform([-0.6, -0.6, 0.4], [0.6, 0.6, 1.5]), rng.standard_normal(3)
         ends = np.array([at, at + LENGTH_M * along / np.linalg.norm(along)])
-        uv = np.array(
-            [c.project_world(ends) + 0.2 * rng.standard_normal((2, 2)) for c in truth.cameras.values()]
-        )
-        seen = np.array([c.sees(uv[k]) for k, c in enumerate(truth.cameras.values())])
-        written = uv + 1
-        if name == "argus":  # rows from the bottom
-            heights = np.array([c.height for c in truth.cameras.values()])
-            written[..., 1] = heights[:, None] - uv[..., 1]
-        rows.append(np.where(seen[..., None], written, np.nan).swapaxes(0, 1).ravel())
-    header = [f"pt{m}_cam{c}_{x}" for m in (1, 2) for c in (1, 2, 3) for x in "XY"]
-    np.savetxt(folder / table, np.array(rows), delimiter=",", header=",".join(header), comments="")
-    FORMATS[name].write(ring(3).intrinsics, folder, FORMATS[name].origin)
+        for camera, lens in arena.truth.cameras.items():
+            uv = lens.project_world(ends) + SIGMA_PX * rng.standard_normal((2, 2))
+            seen = np.flatnonzero(lens.sees(uv))
+            header = {"camera": camera, "width": lens.width, "height": lens.height}
+            ends_seen = Roundels.from_points(uv[seen], SIGMA_PX, seen.astype(np.int32))
+            messages.append(Detections.pack(ends_seen, seq=seq, t_ns=0, **header))
+    write_clicks(name)(folder, arena.intrinsics, STICK, messages)
+    (folder / "xypts.csv").rename(folder / table)

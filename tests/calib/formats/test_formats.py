@@ -22,11 +22,14 @@ from calib.rig.camera import transform
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.rig.wand_file import WandBody
 from calib.wand.calibrate import calibrate
+from camera_node.detection.roundels import Roundels
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_from_wxyz
+from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import read_observations
-from tests.calib.stick import LENGTH_M, write_stick
+from tests.calib.foreign_layouts import write_caliscope
+from tests.calib.stick import LENGTH_M, STICK, write_stick
 from tests.calib.synthetic import camera_errors, ring
 
 EASYWAND_PROFILE = (
@@ -292,26 +295,22 @@ def test_caliscope_cameras_and_points(tmp_path: Path):
 def write_caliscope_session(folder: Path) -> Rig:
     """Write a session as Caliscope 0.11 writes it, and return the true rig: four cameras see a board of 3 x 4 corners,
     of which corner 5 is never detected, in 40 frames, with 0.1 px of noise."""
-    truth, rng = ring(4).truth, np.random.default_rng(3)
-    FORMATS["caliscope"].write(truth, folder, FORMATS["caliscope"].origin)
-    corners = np.array([[0.1 * (k % 3), 0.1 * (k // 3), 0.0] for k in range(12)])
-    rows = ["sync_index,cam_id,object_id,keypoint_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y,obj_loc_z"]
-    times = ["sync_index,cam_id,frame_index,frame_time"]
-    for frame in range(40):
-        t_ns = 300_000_000 * frame
-        at = transform(ring(4).wand_pose(1e-9 * t_ns), corners)
-        for number, camera in enumerate(truth.cameras.values()):
-            times.append(f"{35 + frame},{number},{frame},{25 + 1e-9 * t_ns}")
+    truth, rng, messages = ring(4).truth, np.random.default_rng(3), []
+    board = WandBody(markers=tuple((0.1 * (k % 3), 0.1 * (k // 3), 0.0) for k in range(12)))
+    for seq in range(40):
+        t_ns = 300_000_000 * seq
+        at = transform(ring(4).wand_pose(1e-9 * t_ns), board.points)
+        for name, camera in truth.cameras.items():
             uv = camera.project_world(at) + 0.1 * rng.standard_normal((12, 2))
-            for k in np.flatnonzero(camera.sees(uv)):
-                if k != 5:
-                    place = ",".join(f"{x:g}" for x in corners[k])
-                    rows.append(f"{35 + frame},{number},0,{k},{uv[k, 0]:.6f},{uv[k, 1]:.6f},{place}")
-    (folder / "xy_CHARUCO.csv").write_text("\n".join(rows) + "\n")
+            seen = np.setdiff1d(np.flatnonzero(camera.sees(uv)), [5])
+            corners = Roundels.from_points(uv[seen], 0.1, seen.astype(np.int32))
+            header = {"width": camera.width, "height": camera.height}
+            stamp = t_ns + 25_000_000_000
+            messages.append(Detections.pack(corners, camera=name, seq=seq, t_ns=stamp, **header))
+    write_caliscope(folder, truth, board, messages)
     (folder / "xyz_CHARUCO.csv").write_text(
         "sync_index,object_id,keypoint_id,x_coord,y_coord,z_coord,frame_time\n"
     )
-    (folder / "timestamps.csv").write_text("\n".join(times) + "\n")
     return truth
 
 
@@ -795,13 +794,13 @@ def test_a_lens_with_k3_is_written_with_four_coefficients_where_that_is_near_eno
 
 def test_imported_points_calibrate_a_rig(tmp_path: Path):
     """A stick before three cameras in the tables of DLTdv, with numbers of frames and no diameter: as recorded."""
-    truth, wand = ring(3).truth, WandBody(markers=((0, 0, 0), (LENGTH_M, 0, 0)))
+    truth = ring(3).truth
     write_stick(tmp_path, "dltdv")
     table = tmp_path / "xypts.csv"
     ImportData(format="dltdv", files=(table, tmp_path / "profile.txt"), out=tmp_path).run()
     rig = load_rig(tmp_path / "rig.yaml")
     messages = read_observations(tmp_path / "observations.csv", fps=100.0)
     messages = [msgspec.structs.replace(m, width=800, height=600) for m in messages]
-    result = calibrate(rig, wand, messages, synchronous=True)
+    result = calibrate(rig, STICK, messages, synchronous=True)
     there = Rig(cameras={f"cam{k + 1}": camera for k, camera in enumerate(truth.cameras.values())})
     assert camera_errors(result.rig, there)[0].max() < 0.01
