@@ -87,7 +87,7 @@ def adjust(
     """
     state, converged, choice, weights = _optimize_exactly(problem, observations, start, rounds)
     inliers = observations.select(choice.observations)
-    cameras = profile_motion(linearize(problem, inliers, state, weights), with_least=True)
+    cameras = profile_motion(linearize(problem, inliers, state, weights))
     adjusted = Adjusted(
         problem=problem,
         state=state,
@@ -110,7 +110,7 @@ def with_information(adjusted: Adjusted, problem: Problem, observations: WandObs
     interrupted = error_norms(problem, observations, state, weights).interval > INTERRUPTED
     inliers = observations.select(used)
     chosen = weights.select(Choice(used, interrupted, adjusted.background_used))
-    cameras = profile_motion(linearize(problem, inliers, state, chosen), with_least=True)
+    cameras = profile_motion(linearize(problem, inliers, state, chosen))
     return replace(adjusted, problem=problem, information=cameras.information, scores=cameras.scores)
 
 
@@ -401,7 +401,7 @@ def _all_parameters(problem: Problem, of_cameras: Array) -> Array:
     return step
 
 
-def profile_motion(system: LinearSystem, with_least: bool = False) -> ProfiledMotion:
+def profile_motion(system: LinearSystem) -> ProfiledMotion:
     """Eliminate the motion, then the wand's shape.
 
     With H the Hessian, g the gradient and P the Hessian of the motion prior, the response of the motion is
@@ -411,18 +411,13 @@ def profile_motion(system: LinearSystem, with_least: bool = False) -> ProfiledMo
     and Robins, Econometrica 72, 2004). With J_m^T D = P G the score is D^T r - (P G)^T H_mm^-1 J_m^T r, and the
     information H_cc - G^T (H_mc + P G) - (P G)^T H_mm^-1 P G. Of the shape, the Schur complement is taken of these.
 
-    Args:
-        system: the equations.
-        with_least: add the least information to each knot: the motion that reconciles cameras that contradict each
-            other may lead through a camera, where pixels determine a knot in two directions out of three.
-
     Raises:
         LinAlgError: the motion's Hessian is not positive definite.
     """
     sums = _Sums.of(system)
     h, size = sums.gradient.shape[1], len(sums.of_globals)
     prior = system.motion_prior[:, : 2 * h, : 2 * h]
-    motion = (sums.motion.damp(0.0) if with_least else sums.motion).factorize()
+    motion = sums.motion.factorize()
     right = np.concatenate([sums.crossed, _add_ends(sums.observed[:, :, None])], axis=2)
     G, again = np.split(motion.solve(right), [size], axis=2)
     by_prior = BlockTridiagonal.of_chain(prior).multiply(G)

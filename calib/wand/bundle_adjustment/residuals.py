@@ -41,6 +41,7 @@ SPEED_SIGMA = 3.0  # metres per second of a hand
 SCALE_SIGMA = 1e-6  # relative, of a distance that fixes the scale
 STEP_SIGMA_M = 0.5  # of a position's change in one step: damps positions that too few cameras observe
 BEHIND = 1e4  # sigmas: the residual of a point behind its camera
+NEAREST_M = 1e-3  # a marker nearer to its camera counts as behind it: inside a lens it would fit any pixel
 POINT_STEPS = 3  # of Gauss-Newton: a point moves little while its cameras take one step
 # Relative information that is added to every coordinate: a point on parallel rays stays where it is.
 REGULAR = 1e-9
@@ -154,7 +155,8 @@ def reprojection_errors(problem: Problem, observations: WandObservations, state:
     for c, lens in enumerate(problem.lenses):
         rows, T = observations.camera == c, state.cameras[c]
         local = (points[rows] - T[:3, 3]) @ T[:3, :3]
-        errors[rows] = observations.uv[rows] - state.lens(c, lens).project(local)
+        uv = state.lens(c, lens).project(local)
+        errors[rows] = np.where(local[:, 2:] > NEAREST_M, observations.uv[rows] - uv, np.nan)
     return errors
 
 

@@ -42,18 +42,3 @@ def test_a_matrix_that_is_not_positive_definite_is_refused(block: int):
     diagonal[block] = -diagonal[block]
     with pytest.raises(np.linalg.LinAlgError):
         BlockTridiagonal(diagonal, matrix.below).factorize()
-
-
-def test_the_least_information_determines_a_block_that_observations_do_not():
-    """A point at a camera's centre: its pixels determine two directions of three, with 1e18 of information, whose
-    rounding is more than a camera at some distance adds. They are fitted but for the least information, 2^-22."""
-    matrix, _ = random_chain(6, 8)
-    diagonal, below = matrix.diagonal.copy(), matrix.below.copy()
-    below[3:5] = 0.0
-    seen = np.kron(np.eye(2), np.random.default_rng(2).standard_normal((2, 3)))
-    diagonal[4] = 1e18 * seen.T @ seen
-    columns = np.random.default_rng(0).standard_normal((8, 6, 1))
-    columns[4] = seen.T @ [[1.0], [2.0], [3.0], [4.0]]
-    solved = BlockTridiagonal(diagonal, below).damp(0.0).factorize().solve(columns)
-    off = 1e18 * seen @ solved[4] - [[1.0], [2.0], [3.0], [4.0]]
-    assert np.abs(off).max() < 4 * 2.0**-22 * np.linalg.cond(seen @ seen.T)

@@ -13,6 +13,7 @@ from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.disc_centres import displacement
 from calib.wand.bundle_adjustment.problem import gauge_directions
 from calib.wand.bundle_adjustment.residuals import (
+    NEAREST_M,
     predict_markers,
     reprojection_errors,
     reprojection_jacobians,
@@ -246,3 +247,13 @@ def test_noise_gives_no_clock_parameters(seeds: int):
     result = calibrate(recordings[0].intrinsics, stick, early)
     found = result.time_offset_ms[1] - result.time_offset_ms[[0, 2]].mean()
     assert found == pytest.approx(3.0, abs=4 * 1.5 * result.time_sigma_ms.max())  # of a mean of two
+
+
+def test_a_marker_inside_a_camera_counts_as_behind_it(result: WandCalibration):
+    """There it would fit any pixel, and its derivatives would be beyond double precision."""
+    problem, seen, state = result.adjusted.problem, result.observations, result.adjusted.state
+    for depth, is_known in ((0.5 * NEAREST_M, False), (2 * NEAREST_M, True)):
+        T, motion = state.cameras[0], np.zeros_like(state.motion)
+        motion[:, 0] = T[:3, 3] + depth * T[:3, 2]
+        errors = reprojection_errors(problem, seen, replace(state, motion=motion))
+        assert np.isfinite(errors[seen.camera == 0]).all() == is_known

@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Recordings of others are calibrated as well as by their own programs, with the commands of the documentation."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks.calibration_recordings import DATA
+from tests.benchmarks.public import CALISCOPE, MULTICAMSELFCAL, TAG_WAND, PublicSet, calibrate_set
+
+
+@pytest.mark.parametrize(
+    ("public", "published"), [(TAG_WAND, 0.526), (MULTICAMSELFCAL, 0.27), (CALISCOPE, 1.181)]
+)
+def test_a_recording_of_others_is_calibrated_as_well_as_by_them(
+    tmp_path: Path, public: PublicSet, published: float
+):
+    """All cameras are placed, and the figure is below the published one."""
+    if not (DATA / public.folder).is_dir():
+        pytest.skip(f"{DATA / public.folder} is absent")
+    rig, figure = calibrate_set(public, DATA / public.folder, tmp_path)
+    assert len(rig.placed()) == len(rig.cameras)
+    assert figure < published
