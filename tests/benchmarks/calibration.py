@@ -149,6 +149,8 @@ def webcams_board() -> tuple[list[Row], float]:
 ROWS: dict[str, Callable[[], tuple[list[Row], float]]] = {
     "simulated-8": lambda: simulated(WandScenario(cameras=8), 5),
     "simulated-16": lambda: simulated(WandScenario(cameras=16), 10),
+    "simulated-32": lambda: simulated(WandScenario(cameras=32), 10),
+    "simulated-64": lambda: simulated(WandScenario(cameras=64), 30),
     "lenses-as-calibrated": lambda: simulated(
         WandScenario(cameras=8), 5, lambda recorded: roughly(recorded.intrinsics, CAREFUL, with_sigma=True)
     ),
