@@ -248,7 +248,7 @@ def lens_evidence(adjusted: Adjusted, instead: Array) -> float:
     sigma = np.array([coarse_sigma(adjusted.problem.lenses[k]) for k in estimated]).ravel()
 
     def evidence(off: Array) -> float:
-        likelihood = _log_marginals(information, gradient - information @ off, SHARES[:, None] * sigma)
+        likelihood = _log_marginals(information, gradient - information @ off, sigma)
         return float(np.logaddexp.reduce(likelihood[1:] + np.log(STUDENT[1:])))
 
     return evidence(off) - evidence(0 * off) + float(off @ gradient - off @ information @ off / 2)
@@ -284,19 +284,35 @@ def estimate_shares(information: Array, gradient: Array, sigma: Array, unknown: 
     """(S, 9) share of `sigma` that lenses of `unknown` deviation are off by, the same for all parameters of a kind: the
     root of the posterior mean of its square under `prior`, one kind after the other; 1 for other lenses."""
     shares = np.ones(len(KINDS))
-    for kind in np.tile(np.unique(KINDS), SWEEPS if unknown.any() else 0):
-        tried = np.where(kind == KINDS, SHARES[:, None], shares)
-        trials = np.where(unknown, tried[:, None], 1.0) * sigma
-        likelihood = _log_marginals(information, gradient, trials.reshape(len(SHARES), -1))
+    for kind in np.tile(np.unique(KINDS[unknown.any(axis=0)]), SWEEPS):
+        deviations = (np.where(unknown, shares, 1.0) * sigma).ravel()
+        of_kind = np.ravel(unknown & (kind == KINDS))
+        seen = _integrate_out(information, gradient, ~of_kind, deviations)
+        likelihood = _log_marginals(*seen, sigma.ravel()[of_kind])
         # A share that the prior excludes may be so much likelier that the weights of all others would be 0.
         weight = prior * np.exp(np.minimum(likelihood - likelihood[prior > 0].max(), 0.0))
         shares[kind == KINDS] = max(np.sqrt(weight @ SHARES**2 / weight.sum()), MIN_SHARE)
     return np.where(unknown, shares, 1.0)
 
 
+def _integrate_out(information: Array, gradient: Array, others: Mask, sigma: Array) -> tuple[Array, Array]:
+    """The information and gradient that remain of n parameters without the `others` (n,), whose priors have the
+    deviations `sigma` (n,), which may be 0."""
+    S, kept = sigma[others], ~others
+    crossed = S[:, None] * information[others][:, kept]
+    known = np.eye(len(S)) + S[:, None] * information[others][:, others] * S
+    response = np.linalg.solve(known, np.column_stack([crossed, S * gradient[others]]))
+    remaining = information[kept][:, kept] - crossed.T @ response[:, :-1]
+    return remaining, gradient[kept] - crossed.T @ response[:, -1]
+
+
 def _log_marginals(information: Array, gradient: Array, sigma: Array) -> Array:
-    """(t,) log marginal likelihoods of deviations `sigma` (t, n), with information L and gradient g, parameters
-    integrated out: with S = diag(sigma), g^T S (1 + S L S)^-1 S g / 2 - log det(1 + S L S) / 2."""
-    root = np.linalg.cholesky(np.eye(len(gradient)) + sigma[:, :, None] * information * sigma[:, None])
-    whitened = np.linalg.solve(root, (sigma * gradient)[:, :, None])[:, :, 0]
-    return np.asarray((whitened**2).sum(axis=1) / 2 - np.log(np.einsum("tnn->tn", root)).sum(axis=1), float)
+    """(t,) log marginal likelihoods of the t `SHARES` s of deviations `sigma` (n,), with information L and gradient g,
+    parameters integrated out: with S = diag(sigma) and the eigenvalues w and eigenvectors V of S L S, the sum of
+    (s V^T S g)^2 / (1 + s^2 w) / 2 - log(1 + s^2 w) / 2."""
+    w, V = np.linalg.eigh(sigma[:, None] * information * sigma)
+    squares, w = SHARES[:, None] ** 2, np.maximum(w, 0.0)  # rounding
+    projected = V.T @ (sigma * gradient)
+    return np.asarray(
+        (squares * projected**2 / (1 + squares * w) - np.log1p(squares * w)).sum(axis=1) / 2, float
+    )
