@@ -409,7 +409,8 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     D = J_c - J_m G. A smooth path is shorter than the true one, and cameras that make it longer fit better. So the
     residuals r are fitted once more, r - J_m H_mm^-1 J_m^T r, before they are compared with D (twicing: Newey, Hsieh
     and Robins, Econometrica 72, 2004). With J_m^T D = P G the score is D^T r - (P G)^T H_mm^-1 J_m^T r, and the
-    information H_cc - G^T (H_mc + P G) - (P G)^T H_mm^-1 P G. Of the shape, the Schur complement is taken of these.
+    information H_cc - G^T (H_mc + P G) - (P G)^T H_mm^-1 P G, which is H_cc - M^T H_mm^-1 M + G^T P G with
+    M = H_mc + P G. Of the shape, the Schur complement is taken of these.
 
     Raises:
         LinAlgError: the motion's Hessian is not positive definite.
@@ -421,12 +422,12 @@ def profile_motion(system: LinearSystem) -> ProfiledMotion:
     right = np.concatenate([sums.crossed, _add_ends(sums.observed[:, :, None])], axis=2)
     G, again = np.split(motion.solve(right), [size], axis=2)
     by_prior = BlockTridiagonal.of_chain(prior).multiply(G)
-    along, twice = (sums.crossed + by_prior).reshape(-1, size), motion.solve(by_prior).reshape(-1, size)
+    whitened = motion.whiten(sums.crossed + by_prior).reshape(-1, size)
     # By interval: the prior of each moves the paths of both its knots.
     pulled = sums.observed + (prior @ np.concatenate([again[:-1], again[1:]], axis=1))[:, :, 0]
     scores = sums.scores.copy()
     scores[: len(pulled)] -= (pulled[:, None, :h] @ G[:-1] + pulled[:, None, h:] @ G[1:])[:, 0]
-    information = sums.of_globals - G.reshape(-1, size).T @ along - by_prior.reshape(-1, size).T @ twice
+    information = sums.of_globals - whitened.T @ whitened + G.reshape(-1, size).T @ by_prior.reshape(-1, size)
     rows, (by_priors, prior_gradient) = system.problem.global_rows(), system.priors
     H, gradient = information + by_priors[np.ix_(rows, rows)], scores.sum(axis=0) + prior_gradient[rows]
     cameras = size - system.problem.shapes
@@ -490,28 +491,31 @@ class BlockTridiagonal:
             by_link = trsm(1.0, potrf(blocks[k], lower=1)[0], link.T, lower=1)
             blocks[k + 1] -= by_link.T @ by_link
         root = np.linalg.inv(np.linalg.cholesky(blocks))
-        inverse = root.mT @ root
-        return BlockFactors(inverse, self.below @ inverse[:-1])
+        return BlockFactors(root, self.below @ (root[:-1].mT @ root[:-1]))
 
 
 @dataclass(frozen=True, slots=True)
 class BlockFactors:
-    """L D L^T of a matrix.
+    """L D L^T of a matrix H.
 
     Attributes:
-        inverse: (K, h, h) of the blocks of D.
+        root: (K, h, h) the inverse Cholesky factors of the blocks of D.
         below: (K - 1, h, h) the blocks of L below its diagonal.
     """
 
-    inverse: Array
+    root: Array
     below: Array
 
-    def solve(self, right: Array) -> Array:
-        """The solution for right-hand sides (K, h, n), of the same shape."""
+    def whiten(self, right: Array) -> Array:
+        """R x for columns x (K, h, n), of the same shape, with R^T R = H^-1."""
         x = right.copy()
         for k, below in enumerate(self.below):
             x[k + 1] -= below @ x[k]
-        x = self.inverse @ x
+        return self.root @ x
+
+    def solve(self, right: Array) -> Array:
+        """The solution for right-hand sides (K, h, n), of the same shape."""
+        x = self.root.mT @ self.whiten(right)
         for k in reversed(range(len(self.below))):
             x[k] -= self.below[k].T @ x[k + 1]
         return x

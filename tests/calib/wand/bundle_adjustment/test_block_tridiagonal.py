@@ -29,10 +29,13 @@ def test_products_and_solutions_are_those_of_the_matrix(h: int, blocks: int):
     assert matrix.multiply(columns).reshape(-1, 5) == pytest.approx(
         dense @ flat, abs=1e-12 * np.abs(dense).max()
     )
-    solved = matrix.factorize().solve(columns).reshape(-1, 5)
+    factors = matrix.factorize()
+    solved, whitened = factors.solve(columns).reshape(-1, 5), factors.whiten(columns).reshape(-1, 5)
     expected = np.linalg.solve(dense, flat)
     tolerance = 100 * np.finfo(float).eps * np.linalg.cond(dense)
     assert np.linalg.norm(solved - expected) < tolerance * np.linalg.norm(expected)
+    squared = flat.T @ expected
+    assert np.linalg.norm(whitened.T @ whitened - squared) < tolerance * np.linalg.norm(squared)
 
 
 @pytest.mark.parametrize("block", [0, 4, -1])
