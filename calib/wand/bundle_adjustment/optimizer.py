@@ -490,7 +490,7 @@ class BlockTridiagonal:
             # The Cholesky factor of what remains of this block after the elimination of those before.
             by_link = trsm(1.0, potrf(blocks[k], lower=1)[0], link.T, lower=1)
             blocks[k + 1] -= by_link.T @ by_link
-        root = np.linalg.inv(np.linalg.cholesky(blocks))
+        root = np.asarray(np.linalg.inv(np.linalg.cholesky(blocks)), float)
         return BlockFactors(root, self.below @ (root[:-1].mT @ root[:-1]))
 
 
