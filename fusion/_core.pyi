@@ -73,10 +73,12 @@ class BodyFit:
         sigma: Array,
         shaped: NDArray[np.bool_],
         turned: NDArray[np.bool_],
+        predicted: Array,
         information: Array,
         /,
     ) -> None:
-        """As of `FramePoses`; (N,) whose outlines and whose headings count, and (B, 12, 12) of the bodies."""
+        """As of `FramePoses`; (N,) whose outlines and whose headings count; equations of the centres about the bodies
+        (N, 2, 13), and information (B, 12, 12) about these."""
 
     def linearize(self, headings: Array, /) -> tuple[Array, Array]:
         """The robustly weighted systems of the K moving bodies, all of them at first: (K, 12, 12) and (K, 12).
@@ -242,7 +244,7 @@ def weigh_motions(
     equations: Array,
     body: Index,
     camera: Index,
-    precision: Array,
+    rig_share: Array,
     before: Array,
     shares: Array,
     /,
@@ -251,7 +253,7 @@ def weigh_motions(
     geometric mean of their densities, and the rows of the bodies that two cameras observe; the others do not change.
 
     B predicted bodies: their P, its inverse, dt (B,), densities (B, 2) and single (B,) as of `predict`. equations (N,
-    2, 13) of centres, their body and camera (N,), and their standard deviations (N,) as weighed over their own; before
+    2, 13) of centres, their body and camera (N,), and the shares of their variances (N,) that are the cameras'; before
     (B, 4) probabilities; shares (4,) of the densities: see `native/motion_models.hpp`.
     """
 
@@ -313,8 +315,7 @@ def consider(P: Array, counted: Array, responses: Array, factor: Array, R: Array
     the bodies' own frames (B, 6, 6), body frame, which R (B, 3, 3) turns into the world."""
 
 def are_own(
-    A: Array,
-    nu: Array,
+    equations: Array,
     cov: Array,
     log_density: Array,
     body: Index,
@@ -331,8 +332,8 @@ def are_own(
     """(N,) the assignments that are certain, or more probable as those of their bodies than as any roundels of their
     images.
 
-    By assignment: whitened derivatives A (N, 2, 12), innovations nu (N, 2), covariances of the centres (2, 2, N), px^2,
-    logarithm of the density of roundels (N,), 1/px^2, body and camera (N,), certain (N,). Information (B, 12, 12) of
+    By assignment: equations (N, 2, 13), covariances of the centres (2, 2, N), px^2, logarithm of the density of
+    roundels (N,), 1/px^2, body and camera (N,), certain (N,). Information (B, 12, 12) of
     the predictions. By doubt: a body, a camera or -1 for any, its turn, ascending, the logarithm of how probable the
     uncertain assignments are before, and a variance beside their noise (K,). Each is judged given the assignments that
     are certain, and those that were accepted in the turns before.

@@ -40,6 +40,7 @@ from fusion.model.undistortion import (
     table_of,
 )
 
+EXACT_S = 2e-5  # at 2 m/s the error of a capture time within this is below 0.05 mm
 MAX_ERROR_PX = 3.0  # of a camera, to assign its detections: gates of three times as much reach other roundels
 
 
@@ -65,6 +66,11 @@ class Exposures:
     def tau_sigma(self) -> Array:
         """(F,) standard deviation of `tau`, seconds."""
         return np.hypot(self.clock_sigma, self.stamp_sigma)
+
+    @property
+    def are_exact(self) -> bool:
+        """Whether the times of all frames are known so well that no motion shows their errors."""
+        return not (self.tau_sigma > EXACT_S).any()
 
     @classmethod
     def exact(cls, camera: Index, tau: Array) -> "Exposures":
@@ -290,10 +296,6 @@ class DetectionTable(Columns):
         columns[rows] = values.reshape(columns[rows].shape)
         return replace(self, columns=columns)
 
-    def with_noise(self, added_px2: float) -> "DetectionTable":
-        """The same with a variance added to both coordinates of all centres, px^2."""
-        return self.replaced(COV, self.cov + added_px2 * np.eye(2)[:, :, None]) if added_px2 else self
-
     @property
     def camera(self) -> Index:
         """(N,) index of the camera."""
@@ -475,11 +477,35 @@ class MatchedObservations(Columns):
         """The same of other bodies (N,), as of several states of one robot."""
         return replace(self, discs=replace(self.discs, body=body))
 
+    def with_noise(self, added_px2: float) -> "MatchedObservations":
+        """The same with a variance added to both coordinates of all centres, px^2."""
+        noise = added_px2 * np.eye(2)[:, :, None]
+        return self.of_discs(self.detections.replaced(COV, self.detections.cov + noise), self.discs)
+
     def misfit(self, squared_px: Array) -> Array:
         """(N,) squared residuals (N,), px^2, in standard deviations, including `SLACK_PX`; infinite where these are
         NaN: the disc is not visible."""
         d2 = squared_px / (self.detections.variance_px2 + SLACK_PX**2)
         return np.where(np.isnan(d2), np.inf, d2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearizedObservations(Columns):
+    """N observations, and the equations (N, 2, 13) of their centres about predicted bodies: whitened derivatives by the
+    errors of the bodies, and innovations; zeros where the disc is not visible."""
+
+    matched: MatchedObservations
+    centres: Array
+
+    @property
+    def body(self) -> Index:
+        """(N,) row of the states."""
+        return self.matched.discs.body
+
+    @property
+    def camera(self) -> Index:
+        """(N,) index of the camera."""
+        return self.matched.detections.camera
 
 
 def detection_density(cameras: CameraArray, detections: DetectionTable, frame: Index) -> Array:

@@ -57,6 +57,7 @@ BodyFit::BodyFit(const std::vector<Body>& predicted, const std::vector<Exposure>
 
 Equations BodyFit::equations_at(const FramePoses& poses, size_t k, const Equations* headings) const {
     const size_t n = observed_.centres.discs.size(), n_outlines = shaped_.size();
+    if (k < n && !is_displaced_) return observed_.predicted[k];
     if (k < n) return roundel::fusion::linearize(poses, observed_.centres, k);
     if (k >= n + n_outlines) return headings[k - n - n_outlines];
     return roundel::fusion::linearize(poses, observed_.outlines, shaped_[k - n]);
@@ -106,6 +107,7 @@ bool BodyFit::step(const ErrorVector* steps, double small) {
         if (std::any_of(steps[i].begin(), steps[i].begin() + 6, is_large)) moving.push_back(b);
     }
     moving_ = std::move(moving);
+    is_displaced_ = true;
     return !moving_.empty();
 }
 

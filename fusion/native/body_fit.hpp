@@ -4,10 +4,11 @@
 
 namespace roundel::fusion {
 
-/// The observations of a frame set: centres of discs, and of those that are `shaped` and `turned` also the
-/// outlines and the headings.
+/// The observations of a frame set: centres of discs, with their equations about the predicted bodies, and of
+/// those that are `shaped` and `turned` also the outlines and the headings.
 struct FitObservations {
     CentreObservations centres;
+    const Equations* predicted;
     OutlineObservations outlines;
     const bool *shaped, *turned;
 };
@@ -48,6 +49,7 @@ class BodyFit {
   private:
     Equations equations_at(const FramePoses& poses, size_t k, const Equations* headings) const;
 
+    bool is_displaced_ = false;  // whether the estimates are no more the predictions
     std::vector<Body> predicted_, estimates_;
     std::vector<Exposure> exposures_;
     FitObservations observed_;

@@ -11,6 +11,8 @@ namespace {
 
 /// Of a pivot to its element before: what rounding leaves of zero is less.
 constexpr double kSingular = 1e-9;
+/// Of the variance of a detection, the least share that is its own.
+constexpr double kLeastOwn = 1e-3;
 
 /// The observations of a body as independent errors z of unit variance, to which the errors of its state
 /// contribute G^T delta: with H = A^T A and g = A^T b over the equations, H = G G^T and g = G z. Columns of G
@@ -113,7 +115,8 @@ std::vector<size_t> weigh_motions(const PredictedBodies& predicted, const ModelN
         ErrorMatrix H{};
         ErrorVector g{};
         for (const size_t* k = begin; k < end; ++k)
-            add(predicted.observed.equations[*k], predicted.precision[*k], H, g);
+            add(predicted.observed.equations[*k],
+                1 / std::sqrt(std::max(1 - predicted.rig_share[*k], kLeastOwn)), H, g);
         const auto [G, z] = reduce(H, g);
         const ErrorMatrix noise = process_noise(predicted.bodies[b], predicted.intervals[b]);
         ErrorMatrix S = congruent(G, predicted.P[b]);

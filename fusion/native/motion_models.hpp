@@ -6,15 +6,15 @@
 namespace roundel::fusion {
 
 /// B predicted bodies: states, covariances by the declared densities, the intervals that they were predicted
-/// by, and the linearized centres of their detections; of each the camera and by how much its noise is less
-/// than the unit of the equations.
+/// by, and the linearized centres of their detections; of each the camera and the share of its variance that
+/// counts the errors of the camera.
 struct PredictedBodies {
     const Body* bodies;
     const ErrorMatrix* P;
     const MotionInterval* intervals;
     EquationSystem observed;
     const int64_t* camera;
-    const double* precision;
+    const double* rig_share;
 };
 
 constexpr int kModels = 4;

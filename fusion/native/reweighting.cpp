@@ -139,8 +139,9 @@ struct NoisyEquations {
             u = L.a / noisy.a * x;
             v = (L.b * x + L.c * y - noisy.b * u) / noisy.c;
         };
-        for (int i = 0; i < kErrors; ++i) whiten(evidence.A[k][0][i], evidence.A[k][1][i], A[0][i], A[1][i]);
-        whiten(evidence.nu[k][0], evidence.nu[k][1], nu[0], nu[1]);
+        const auto& [u, v] = evidence.system.equations[k].A;
+        for (int i = 0; i < kErrors; ++i) whiten(u[i], v[i], A[0][i], A[1][i]);
+        whiten(u[kErrors], v[kErrors], nu[0], nu[1]);
     }
 };
 
@@ -179,12 +180,13 @@ double log_ratio(const Evidence& evidence, const std::vector<size_t>& certain,
 }  // namespace
 
 void accept(const Evidence& evidence, const Doubts& doubts, const ErrorMatrix* information, bool* certain) {
+    const ByBody of(evidence.system);
     std::vector<size_t> accepted;
     for (size_t d = 0; d < doubts.n; ++d) {
         const int64_t body = doubts.body[d], camera = doubts.camera[d];
         std::vector<size_t> beside, rows;
-        for (size_t k = 0; k < evidence.cov.n; ++k) {
-            if (evidence.body[k] != body) continue;
+        for (size_t at = of.first[body]; at < of.first[body + 1]; ++at) {
+            const size_t k = of.indices[at];
             if (certain[k])
                 beside.push_back(k);
             else if (camera < 0 || evidence.camera[k] == camera)

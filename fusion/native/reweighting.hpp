@@ -41,14 +41,13 @@ void reweigh(const EquationSystem& system, ErrorMatrix* H, ErrorVector* g, doubl
 /// Writes 2 x N whitened residuals b - A delta of the steps delta (K x 12).
 void residuals(const EquationSystem& system, const double* steps, double* to);
 
-/// N linearized assignments: whitened derivatives and innovations, the covariances of the centres (pixels^2),
-/// the logarithm of the density of other roundels (per pixel^2), the body and the camera.
+/// N assignments about the predicted bodies: by each the covariance of the centre (pixels^2), the logarithm
+/// of the density of other roundels (per pixel^2), and the camera.
 struct Evidence {
-    const double (*A)[2][kErrors];
-    const double (*nu)[2];
+    EquationSystem system;
     Columns<4> cov;
     const double* log_density;
-    const int64_t *body, *camera;
+    const int64_t* camera;
 };
 
 /// K doubts whether the assignments of a body in a camera, or in any (-1), are its own: the logarithm of how

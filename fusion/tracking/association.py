@@ -38,11 +38,10 @@ from fusion.model.observations import (
     CameraArray,
     DetectionTable,
     MarkerTable,
-    MatchedObservations,
     detection_density,
 )
 from fusion.model.states import POSITION, VELOCITY, States
-from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.estimator import AssignedFrames, Prediction
 from fusion.tracking.labelings import MISSED, Labelings, find_labelings
 from fusion.tracking.rays import GATE
 
@@ -187,23 +186,6 @@ class AssociatedFrames:
     association: Association
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AssignedFrames:
-    """Frames of a frame set with their assignments before the update.
-
-    Attributes:
-        prediction: of all robots.
-        tracked: (R,) robots whose detections were assigned.
-        detections: of all frames.
-        assignments: of the detections.
-    """
-
-    prediction: Prediction
-    tracked: Mask
-    detections: DetectionTable
-    assignments: Assignments
-
-
 def _first_rows(frames: Sequence[CalibratedFrame]) -> Index:
     """The row of each frame's first detection in a detection table."""
     return np.cumsum([0, *(frame.columns.shape[1] for frame in frames)])[:-1]
@@ -220,7 +202,7 @@ class OwnDetections:
 
     Args:
         cameras: cameras of the rig.
-        estimator: of all robots.
+        n_robots: number of robots.
         markers: of all robots.
 
     Attributes:
@@ -228,9 +210,9 @@ class OwnDetections:
             with their frames.
     """
 
-    def __init__(self, cameras: CameraArray, estimator: Estimator, markers: MarkerTable) -> None:
-        self._cameras, self._estimator, self._markers = cameras, estimator, markers
-        self._shape = (len(estimator.single), len(cameras.names))
+    def __init__(self, cameras: CameraArray, n_robots: int, markers: MarkerTable) -> None:
+        self._cameras, self._markers = cameras, markers
+        self._shape = (n_robots, len(cameras.names))
         self._usual, self._learned = np.zeros(self._shape), np.zeros(self._shape, np.intp)
         self._unseen = np.zeros(self._shape, bool)  # in the last frame of the camera
         self._elsewhere = np.zeros(len(cameras.names), np.intp)  # frame sets in a row, of each camera
@@ -244,9 +226,8 @@ class OwnDetections:
             noise_px2: variance that detections usually have beside their own noise: of a view that shows little of a
                 robot, the rest may be outside the gates by errors of the camera.
         """
-        robot = self._markers.robot[given.assignments.marker]
-        frame = given.detections.frame[given.assignments.detection]
-        view = robot * self._shape[1] + given.detections.exposures.camera[frame]
+        robot, camera = given.observations.body, given.observations.camera
+        view = robot * self._shape[1] + camera
         frames = np.bincount(given.detections.exposures.camera, minlength=self._shape[1])
         count = self._count(view)
         missing = np.maximum(self._usual * frames - count, 0)
@@ -262,9 +243,9 @@ class OwnDetections:
         cluttered = present & ~unseen & self._cluttered(given)
         partial = present & ~unseen & ~cluttered & ((missing > count) | self._shows_few(given, count))
         doubtful = unseen | cluttered | partial
-        own = ~(fallen[robot] | doubtful.ravel()[view] | displaced[view % self._shape[1]])
+        own = ~(fallen[robot] | doubtful.ravel()[view] | displaced[camera])
         prior = cost[fallen] - CHANGED
-        own = self._accepted(given, view, own, (fallen, prior), (cluttered, partial, unseen), noise_px2)
+        own = self._accepted(given, own, (fallen, prior), (cluttered, partial, unseen), noise_px2)
         self._learn(self._count(view[own]), frames, given.tracked)
         return own
 
@@ -312,7 +293,6 @@ class OwnDetections:
     def _accepted(
         self,
         given: AssignedFrames,
-        view: Index,
         certain: Mask,
         fallen: tuple[Mask, Array],
         views: tuple[Mask, Mask, Mask],
@@ -322,13 +302,11 @@ class OwnDetections:
 
         Args:
             given: N assignments of a frame set.
-            view: (N,) of the assignments, robot and camera.
             certain: (N,) assignments that are not to be judged.
             fallen: (R,) robots of which much is missing, and the logarithm of how probable the rest of each is.
             views: (R, C) those in clutter, those that show few, and those that were not seen before.
             noise_px2: see `are_own`; of the views that show few.
         """
-        n_cameras = self._shape[1]
         robots, asked = np.flatnonzero(fallen[0]), [np.nonzero(of_kind) for of_kind in views]
         of_robot = np.concatenate([robots, *(robot for robot, _ in asked)])
         if not len(of_robot):
@@ -338,19 +316,13 @@ class OwnDetections:
         turn = np.repeat([0, 0, 1, 2], [len(robots), *(len(robot) for robot, _ in asked)])
         prior, added_px2 = np.where(turn == 2, CHANGED, 0.0), np.where(turn == 1, noise_px2, 0.0)
         prior[: len(robots)] = fallen[1]
-        is_asked = np.zeros(self._shape[0], bool)
-        is_asked[of_robot] = True
-        rows = np.flatnonzero(is_asked[view // n_cameras])
-        robot, camera = np.divmod(view[rows], n_cameras)
-        observations = MatchedObservations.of(given.assignments.select(rows), given.detections, self._markers)
-        A, nu = self._estimator.innovations(given.prediction.states, observations)
+        observed = given.observations
+        seen = observed.matched.detections
         density = detection_density(self._cameras, given.detections, given.detections.frame)
-        seen = observations.detections.cov, np.log(density[observations.detections.frame]), robot, camera
+        log_density = np.log(density[seen.frame])
+        evidence = observed.centres, seen.cov, log_density, observed.body, seen.camera, certain
         doubts = of_robot, of_camera, turn, prior, added_px2
-        evidence = A.reshape(-1, 2, 12), nu.reshape(-1, 2), *seen, certain[rows], given.prediction.information
-        own = certain.copy()
-        own[rows] = _core.are_own(*evidence, *doubts)
-        return own
+        return _core.are_own(*evidence, given.prediction.information, *doubts)
 
     def _find_displaced(self, given: AssignedFrames, count: Index, missing: Array) -> Mask:
         """(C,) the cameras in which most markers that they usually show are elsewhere, all by one turn, while another

@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from camera_node.foundation.arrays import Array, Mask
 from fusion import _core
-from fusion.model.observations import CameraArray, MatchedObservations, Views, mean_by_body
+from fusion.model.observations import (
+    EXACT_S,
+    Assignments,
+    CameraArray,
+    DetectionTable,
+    LinearizedObservations,
+    MatchedObservations,
+    Views,
+    mean_by_body,
+)
 from fusion.model.states import OMEGA, VELOCITY, States, Transition, predict, reset_unobservable
 from fusion.model.undistortion import COV, OUTLINE
 from fusion.tracking.gating import AXIS_SIGMA_PX
@@ -26,7 +35,6 @@ from fusion.tracking.headings import linearize_headings, read_headings
 MAX_ITERATIONS = 8
 SMALL = 0.03  # rad and m; the second-order error of a smaller correction is below the noise of a detection
 STEADY_S = 0.02  # during which velocities count as constant: half the period of a slow camera
-EXACT_S = 2e-5  # at 2 m/s the error of a capture time within this is below 0.05 mm
 MIN_SHAPED = 3  # visible markers from which a body does not need the shapes of outlines
 
 
@@ -46,6 +54,33 @@ class Prediction:
         """States at the time of the frame set."""
         n = len(states)
         return cls(states, _core.inverses(states.P), Transition(np.zeros((n, 3, 3)), np.zeros(n)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AssignedFrames:
+    """Frames of a frame set with their assignments before the update.
+
+    Attributes:
+        prediction: of all robots.
+        tracked: (R,) robots whose detections were assigned.
+        detections: of all frames.
+        assignments: of the detections.
+        observations: of the assignments, row by row, linearized about the prediction.
+    """
+
+    prediction: Prediction
+    tracked: Mask
+    detections: DetectionTable
+    assignments: Assignments
+    observations: LinearizedObservations
+
+    def select(self, rows: Mask) -> "AssignedFrames":
+        """The same with some of the assignments."""
+        if rows.all():
+            return self
+        return replace(
+            self, assignments=self.assignments.select(rows), observations=self.observations.select(rows)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,12 +137,22 @@ class Estimator:
         fitted = self.fit(prediction, self.prepared(prediction.states, observations), small)
         return fitted.states, fitted.squared_px
 
-    def prepared(self, states: States, observations: MatchedObservations) -> MatchedObservations:
-        """Observations as `fit` takes them: with straight outlines, and the noise of late frames and of clocks."""
-        return self.with_time_errors(states, self._straighten(states, observations))
+    def prepared(self, states: States, observations: MatchedObservations) -> LinearizedObservations:
+        """Observations of predicted bodies with straight outlines, and the noise of late frames and of clocks."""
+        return self.linearized(states, self.with_time_errors(states, self._straighten(states, observations)))
 
-    def fit(self, prediction: Prediction, observations: MatchedObservations, small: float = SMALL) -> BodyFit:
-        """`update` by `prepared` observations."""
+    def linearized(self, states: States, observations: MatchedObservations) -> LinearizedObservations:
+        """Observations with the equations of their centres about predicted bodies."""
+        seen, whiten = observations.detections, observations.whiten
+        poses = self.cameras.frame_poses(states, seen.exposures)
+        centres = poses.linearize_centres(observations.discs.columns, seen.xy, whiten, self.single)
+        return LinearizedObservations(observations, centres)
+
+    def fit(
+        self, prediction: Prediction, linearized: LinearizedObservations, small: float = SMALL
+    ) -> BodyFit:
+        """`update` by `prepared` observations, linearized about the prediction."""
+        observations = linearized.matched
         states, seen, discs = prediction.states, observations.detections, observations.discs
         if not len(observations):
             return BodyFit(states, np.empty(0), np.zeros(len(states)), np.empty((0, 2, 13)), np.empty(0))
@@ -127,6 +172,7 @@ class Estimator:
             sigma,
             _shaped(observations),
             turned,
+            linearized.centres,
             prediction.information,
         )
         for _ in range(MAX_ITERATIONS):
@@ -143,15 +189,9 @@ class Estimator:
         """With the noise of late frames and of the clocks of the cameras."""
         return self._inflate_by_clock(states, self._inflate_late(states, observations))
 
-    def centres(self, states: States, observations: MatchedObservations) -> Array:
-        """(N, 2, 13) equations of N centres: whitened derivatives by the errors of their bodies, and innovations."""
-        seen, discs = observations.detections, observations.discs
-        poses = self.cameras.frame_poses(states, seen.exposures)
-        return poses.linearize_centres(discs.columns, seen.xy, observations.whiten, self.single)
-
     def innovations(self, states: States, observations: MatchedObservations) -> tuple[Array, Array]:
         """The whitened derivatives (2 N, 12) of N centres by the errors of their bodies, and innovations (2 N,)."""
-        equations = self.centres(states, observations)
+        equations = self.linearized(states, observations).centres
         return equations[:, :, :12].reshape(-1, 12), equations[:, :, 12].ravel()
 
     def motion_px2(self, states: States, observations: MatchedObservations) -> Array:
@@ -220,7 +260,7 @@ class Estimator:
         """
         detections, discs = observations.detections, observations.discs
         exposures = detections.exposures
-        if not (exposures.tau_sigma > EXACT_S).any():
+        if exposures.are_exact:
             return observations
         now = self._views(states, observations)
         velocity = self._image_velocity(states, observations, now)

@@ -219,8 +219,9 @@ def _margins(
     estimator, states = estimator.select(bodies), prediction.states.select(bodies)
     prepared = estimator.prepared(states, observations)
     fit = estimator.fit(Prediction(states, prediction.information[bodies], prediction.motion), prepared)
-    noise = np.linalg.slogdet(np.moveaxis(prepared.detections.cov, 2, 0))[1] + 2 * np.log(2 * np.pi)
-    of_none = unpaired_cost(estimator.cameras, detections)[prepared.detections.frame]
+    seen = prepared.matched.detections
+    noise = np.linalg.slogdet(np.moveaxis(seen.cov, 2, 0))[1] + 2 * np.log(2 * np.pi)
+    of_none = unpaired_cost(estimator.cameras, detections)[seen.frame]
     cost = fit.cost + np.bincount(body, noise - of_none, len(bodies)) - np.linalg.slogdet(fit.states.P)[1]
     most = chi2.isf(IMPOSSIBLE, 2 * np.maximum(np.bincount(body, minlength=len(bodies)), 1))
     n = len(robots)

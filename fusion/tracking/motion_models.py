@@ -20,15 +20,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.arrays import Index
 from fusion import _core
-from fusion.model.observations import MatchedObservations
+from fusion.model.observations import LinearizedObservations
 from fusion.tracking.estimator import Estimator, Prediction
 
 # Of the declared density, as of accelerations of 10 m/s^2 (`aerial`), 2.2, 0.5 and 0.1 m/s^2, which is at rest.
 SHARES = np.array([1.0, 1 / 20, 1 / 400, 1 / 8000])
 PHASE_S = 0.5  # mean duration of a phase of motion with one density: of starting, driving evenly, or turning
-LEAST_OWN = 1e-3  # share of the variance of a detection that is its own
 
 
 class MotionModels:
@@ -54,18 +53,20 @@ class MotionModels:
         """Continue with the robots of another one, whose rows `same` has by row."""
         self.probabilities[list(same)] = old.probabilities[list(same.values())]
 
-    def narrowed(self, prediction: Prediction, observations: MatchedObservations) -> Prediction:
+    def narrowed(self, prediction: Prediction, observations: LinearizedObservations) -> Prediction:
         """The prediction by the densities that the observations show; by the declared ones of robots that fewer than
-        two cameras see, because one shows no motion along its rays.
+        two cameras see, because one shows no motion along its rays. Innovations count in deviations of the detections'
+        own noise: the errors of cameras that the filter counts as noise are the same in all frame sets.
 
         Args:
             prediction: of all robots, by the declared densities.
-            observations: of a frame set that does not contradict the rig: else innovations show no motion.
+            observations: of a frame set, linearized about that prediction; it does not contradict the rig: else
+                innovations show no motion.
         """
         estimator, states, dt = self._estimator, prediction.states, prediction.motion.dt
         stays = np.exp(-dt / PHASE_S)[:, None]
         before = stays * self.probabilities + (1 - stays) / len(SHARES)
-        observations = estimator.prepared(states, observations)
+        camera = observations.camera
         self.probabilities, P, information, rows = _core.weigh_motions(
             states.bodies,
             states.P,
@@ -73,21 +74,13 @@ class MotionModels:
             dt,
             estimator.densities,
             estimator.single,
-            estimator.centres(states, observations),
-            observations.discs.body,
-            observations.detections.camera,
-            self._precision(observations),
+            observations.centres,
+            observations.body,
+            camera,
+            estimator.cameras.error_px[camera] ** 2 / observations.matched.detections.variance_px2,
             before,
             SHARES,
         )
         risen = (self.probabilities[rows] - before[rows]) @ np.log(SHARES)
         self.is_sudden = bool(len(rows)) and bool(np.median(risen) > -np.log(SHARES[1]))
         return Prediction(replace(states, P=P), information, prediction.motion)
-
-    def _precision(self, observations: MatchedObservations) -> Array:
-        """(N,) standard deviations by which the filter weighs detections, over their own. The errors of cameras that it
-        counts as noise are the same in all frame sets: innovations are smaller, and motion shows earlier."""
-        seen = observations.detections
-        variance_px2 = seen.variance_px2
-        own = 1 - self._estimator.cameras.error_px[seen.camera] ** 2 / variance_px2
-        return 1 / np.sqrt(np.maximum(own, LEAST_OWN))

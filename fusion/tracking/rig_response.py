@@ -54,7 +54,7 @@ class RigResponse:
         """Follow a step of the filter, whose added noise the detections of a camera have in common."""
         equations = fitted.equations, fitted.weights
         predicted = fitted.prediction.information, fitted.prediction.motion
-        self._follow(fitted.states, fitted.observations, equations, predicted, fitted.added_px2)
+        self._follow(fitted.states, fitted.observations.matched, equations, predicted, fitted.added_px2)
 
     def forget(self, rows: Index) -> None:
         """The errors of robots (rows) that start from a state of unknown origin follow none of the cameras."""

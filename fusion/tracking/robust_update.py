@@ -26,7 +26,7 @@ from camera_node.foundation.arrays import Array, Index, Mask
 from fusion import _core
 from fusion.model.observations import (
     Assignments,
-    DetectionTable,
+    LinearizedObservations,
     MarkerTable,
     MatchedObservations,
     count_checked,
@@ -35,7 +35,7 @@ from fusion.model.observations import (
 )
 from fusion.model.states import POSITION, VELOCITY, States
 from fusion.monitoring.residual_monitor import FALSE_ALARM, LEARNED, ResidualMonitor, camera_at_fault
-from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.estimator import AssignedFrames, Estimator, Prediction
 from fusion.tracking.gating import MAX_CHI2
 from fusion.tracking.labelings import are_unchecked
 from fusion.tracking.rays import GATE
@@ -55,10 +55,8 @@ class RobustFit:
     """An update: the states, and the assignments that fit, with residuals.
 
     Attributes:
-        prediction: the robots before the update.
+        given: the robots before the update, and the assignments that were fitted, also those that do not fit.
         needed: (R,) see `TrackTable.needed_detections`.
-        detections: of the frame set.
-        given: the assignments that were fitted, also those that do not fit.
         observations, equations, weights: of the assignments, row by row, with the noise that the fit gives them; see
             `BodyFit`.
         cost, count: (R,) of each robot: its fit, as of `BodyFit`, and its detections.
@@ -68,11 +66,9 @@ class RobustFit:
 
     states: States
     assignments: Assignments
-    prediction: Prediction
+    given: AssignedFrames
     needed: Index
-    detections: DetectionTable
-    given: Assignments
-    observations: MatchedObservations
+    observations: LinearizedObservations
     equations: Array
     weights: Array
     cost: Array
@@ -80,9 +76,14 @@ class RobustFit:
     contradicting: Array
     added_px2: float
 
+    @property
+    def prediction(self) -> Prediction:
+        """The robots before the update."""
+        return self.given.prediction
+
     def without(self, contradicted: Mask) -> "RobustFit":
         """Robots (R,) that their detections contradict stay as predicted and lose them."""
-        rows, kept = np.flatnonzero(contradicted), ~contradicted[self.observations.discs.body]
+        rows, kept = np.flatnonzero(contradicted), ~contradicted[self.observations.body]
         return replace(
             self,
             states=self.states.with_rows(rows, self.prediction.states.select(rows)),
@@ -146,7 +147,7 @@ class RobustUpdate:
         before, v = fitted.prediction.states, fitted.states.v - fitted.prediction.states.v
         gained = np.linalg.solve(before.P[:, VELOCITY, VELOCITY], v[:, :, None])[:, :, 0]
         differs = np.einsum("ni,ni->n", v, gained) > chdtri(3, FALSE_ALARM)
-        cameras = fitted.detections.exposures.camera  # without frames of all, robots may only be unseen
+        cameras = fitted.given.detections.exposures.camera  # without frames of all, robots may only be unseen
         is_whole = len(np.unique(cameras)) == len(self._estimator.cameras.names)
         refuted = tracked & (differs | ((fitted.count == 0) & is_whole))
         return refuted & (2 * refuted.sum() > tracked.sum())
@@ -155,17 +156,10 @@ class RobustUpdate:
         """The rig graph judged what the detections contradict: what is usual from now on is learnt."""
         self._residuals, self._left_out, self.added_px2 = ResidualMonitor(), None, 0.0
 
-    def update(
-        self,
-        prediction: Prediction,
-        needed: Index,
-        detections: DetectionTable,
-        assignments: Assignments,
-        is_sudden: bool,
-    ) -> RobustFit:
+    def update(self, given: AssignedFrames, needed: Index, is_sudden: bool) -> RobustFit:
         """The updated states, and the assignments that fit; `needed` as of `RobustFit`, `is_sudden` as of
         `MotionModels`: then a camera that explains it alone has moved, and the robots have not."""
-        fitted = self._fit(prediction, needed, detections, assignments)
+        fitted = self._fit(given, needed)
         if self.added_px2:
             self.added_px2 *= 0.5 ** (1 / LEARNED) if self.added_px2 > self._least_px2(fitted) else 0.0
         self.is_confirmed |= self._residuals.is_known
@@ -181,7 +175,7 @@ class RobustUpdate:
         else:
             self._left_out = None
             if self.added_px2:
-                fitted = self._again(fitted, fitted.given, self.added_px2)
+                fitted = self._fit(fitted.given, needed, self.added_px2)
             else:
                 self._residuals.learn(fitted.assignments.squared_px, fitted.cost, fitted.count)
         return self._without_incompatible(self._without_wrong_views(fitted))
@@ -189,11 +183,12 @@ class RobustUpdate:
     @staticmethod
     def _least_px2(fitted: RobustFit) -> float:
         """Less noise than detections have themselves changes nothing."""
-        return float(fitted.detections.variance_px2.mean()) if len(fitted.detections) else 0.0
+        detections = fitted.given.detections
+        return float(detections.variance_px2.mean()) if len(detections) else 0.0
 
     def _contradiction_px2(self, fitted: RobustFit) -> float:
         """What velocities explain that the predictions do not have, of the median robot that two cameras see."""
-        before, after, of = fitted.prediction.states, fitted.states, fitted.observations
+        before, after, of = fitted.prediction.states, fitted.states, fitted.observations.matched
         seen = np.flatnonzero(count_checked(of.discs.body, of.detections.camera, len(after)))
         if not len(seen):
             return 0.0
@@ -203,32 +198,24 @@ class RobustUpdate:
     def _is_unusual(self, fitted: RobustFit) -> bool:
         return self._residuals.is_unusual(fitted.cost, fitted.count)
 
-    def _fit(
-        self,
-        prediction: Prediction,
-        needed: Index,
-        detections: DetectionTable,
-        assignments: Assignments,
-        added_px2: float = 0.0,
-    ) -> RobustFit:
+    def _fit(self, given: AssignedFrames, needed: Index, added_px2: float = 0.0) -> RobustFit:
         """The updated states; a robot that its detections contradict stays as predicted and loses them, as does one
         whose prediction does not check them, if they contradict each other or are too few."""
-        noisy = detections.with_noise(added_px2)
-        observations = MatchedObservations.of(assignments, noisy, self._markers)
-        observations = self._estimator.prepared(prediction.states, observations)
+        prediction, observations = given.prediction, given.observations
+        if added_px2:
+            noisy = observations.matched.with_noise(added_px2)
+            observations = self._estimator.linearized(prediction.states, noisy)
         fitted = self._estimator.fit(prediction, observations)
-        body, n = observations.discs.body, len(prediction.states)
-        is_large = observations.misfit(fitted.squared_px) > MAX_CHI2
+        body, n = observations.body, len(prediction.states)
+        is_large = observations.matched.misfit(fitted.squared_px) > MAX_CHI2
         share = mean_by_body(is_large, body, n)
         contradicted = share > np.where(needed, 0.0, CONTRADICTED)
-        contradicted |= are_unchecked(needed, body, observations.detections.camera)
+        contradicted |= are_unchecked(needed, body, observations.camera)
         fit = RobustFit(
             states=fitted.states,
-            assignments=assignments.with_residuals(fitted.squared_px),
-            prediction=prediction,
+            assignments=given.assignments.with_residuals(fitted.squared_px),
+            given=given,
             needed=needed,
-            detections=detections,
-            given=assignments,
             observations=observations,
             equations=fitted.equations,
             weights=fitted.weights,
@@ -239,13 +226,9 @@ class RobustUpdate:
         )
         return fit.without(contradicted) if contradicted.any() else fit
 
-    def _again(self, fitted: RobustFit, given: Assignments, added_px2: float = 0.0) -> RobustFit:
-        """The fit of other assignments, or with another noise."""
-        return self._fit(fitted.prediction, fitted.needed, fitted.detections, given, added_px2)
-
     def _without(self, k: int, fitted: RobustFit) -> RobustFit:
-        camera = fitted.detections.camera[fitted.given.detection]
-        return self._again(fitted, fitted.given.select(camera != k))
+        given = fitted.given
+        return self._fit(given.select(given.observations.camera != k), fitted.needed)
 
     def _left_out_again(self, fitted: RobustFit) -> RobustFit | None:
         """The fit without the camera that was left out before, while that one does not agree with it."""
@@ -257,7 +240,7 @@ class RobustUpdate:
 
     def _leave_one_out(self, fitted: RobustFit) -> RobustFit | None:
         """The fit without the camera that contradicts predictions and all others, if there is one."""
-        camera = fitted.detections.camera[fitted.given.detection]
+        camera = fitted.given.observations.camera
         fits = {k: self._without(k, fitted) for k in np.unique(camera).tolist()}
         costs = {k: float(fit.cost.sum()) for k, fit in fits.items()}
         self._left_out = camera_at_fault(float(fitted.cost.sum()), costs)
@@ -268,7 +251,7 @@ class RobustUpdate:
     def _with_noise(self, fitted: RobustFit) -> RobustFit:
         """The fit with as much noise as makes it usual, no less than the frame set before had."""
         self.added_px2 = max(self.added_px2, self._least_px2(fitted))
-        while self._is_unusual(again := self._again(fitted, fitted.given, self.added_px2)):
+        while self._is_unusual(again := self._fit(fitted.given, fitted.needed, self.added_px2)):
             self.added_px2 *= 2
             if self.added_px2 > MAX_ADDED_PX2:
                 break
@@ -281,11 +264,11 @@ class RobustUpdate:
         if not len(doubtful) or np.median(fitted.contradicting[fitted.count > 0]) > 0:
             return fitted
         given = fitted.given
-        robot, camera = self._markers.robot[given.marker], fitted.detections.camera[given.detection]
+        robot, camera = given.observations.body, given.observations.camera
         seen = views(robot, camera, len(fitted.contradicting))
         is_doubtful, wrong = np.isin(robot, doubtful), np.zeros_like(seen)
         costs = {
-            k: self._again(fitted, given.select(is_doubtful & (camera != k)), fitted.added_px2).cost
+            k: self._fit(given.select(is_doubtful & (camera != k)), fitted.needed, fitted.added_px2).cost
             for k in np.flatnonzero(seen[doubtful].any(0)).tolist()
         }
         for row in doubtful.tolist():
@@ -295,7 +278,7 @@ class RobustUpdate:
                 wrong[row, k] = True
         if not wrong.any():
             return fitted
-        return self._again(fitted, given.select(~wrong[robot, camera]), fitted.added_px2)
+        return self._fit(given.select(~wrong[robot, camera]), fitted.needed, fitted.added_px2)
 
     def _without_incompatible(self, fitted: RobustFit) -> RobustFit:
         """The fit to detections that do not contradict the others of their robots; all keep their residuals.
@@ -303,7 +286,7 @@ class RobustUpdate:
         A robot whose compatible detections fit already stays as it is: the others have hardly any weight.
         """
         slack_px2 = self._residuals.slack_px**2, fitted.added_px2
-        detections, robot = fitted.detections, self._markers.robot[fitted.assignments.marker]
+        detections, robot = fitted.given.detections, self._markers.robot[fitted.assignments.marker]
         suspicious = fitted.assignments.squared_px > SUSPICIOUS * sum(slack_px2)
         if not suspicious.any():
             return fitted

@@ -21,9 +21,9 @@ from fusion.monitoring.size_check import SizeCheck
 from fusion.protocol.arena_health import describe_contradiction
 from fusion.protocol.pose_messages import Contradiction, RobotPose
 from fusion.tracking.acquisition import Acquired, Acquisition
-from fusion.tracking.association import AssignedFrames, AssociatedFrames, Association, OwnDetections
+from fusion.tracking.association import AssociatedFrames, Association, OwnDetections
 from fusion.tracking.claim_check import ClaimCheck
-from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.estimator import AssignedFrames, Estimator, Prediction
 from fusion.tracking.identification import RefinedFits
 from fusion.tracking.labelings import choose_labelings
 from fusion.tracking.motion_models import MotionModels
@@ -102,7 +102,7 @@ class Tracker:
             -1, 2
         )  # without robots too
         self.estimator = Estimator(self.cameras, densities, self.table.single)
-        self.own = OwnDetections(self.cameras, self.estimator, self.table.markers)
+        self.own = OwnDetections(self.cameras, len(robots), self.table.markers)
         self.motion = MotionModels(self.estimator)
         self.robust = RobustUpdate(self.estimator, self.table.markers)
         self.rig_response = RigResponse(self.estimator)
@@ -274,14 +274,19 @@ class Tracker:
     ) -> RobustFit:
         """Update the states of the robots; its assignments are those that fit, with residuals."""
         prediction, tracked = associated.prediction, associated.tracked
-        given = AssignedFrames(prediction, tracked, detections, assignments)
-        own = assignments.select(self.own.are_own(given, self.robust.noise_px2))
+        observed = MatchedObservations.of(assignments, detections, self.table.markers)
+        observations = self.estimator.prepared(prediction.states, observed)
+        given = AssignedFrames(prediction, tracked, detections, assignments, observations)
+        own = self.own.are_own(given, self.robust.noise_px2)
+        given = given.select(own)
         if self.robust.is_doubtful or self.own.displaced or self.monitors.rig.contradicting:
             self.motion.restart()
         else:
-            seen = MatchedObservations.of(own, detections, self.table.markers)
-            prediction = self.motion.narrowed(prediction, seen)
-        fitted = self.robust.update(prediction, needed, detections, own, self.motion.is_sudden)
+            given = replace(given, prediction=self.motion.narrowed(prediction, given.observations))
+            if not detections.exposures.are_exact:  # where velocities are better known, times make less noise
+                observations = self.estimator.prepared(given.prediction.states, observed.select(own))
+                given = replace(given, observations=observations)
+        fitted = self.robust.update(given, needed, self.motion.is_sudden)
         refuted = self.robust.refuted(fitted, tracked & self.table.searched)
         if refuted.any():
             fitted = fitted.without(refuted)

@@ -198,7 +198,7 @@ def refine(
         shared_views(starts.assignments, body, detections, n),
         starts.assignments.with_residuals(fit.squared_px),
         body,
-        prepared,
+        prepared.matched,
         fit.equations,
         fit.weights,
     )
@@ -213,11 +213,15 @@ def with_noise(estimator: Estimator, fits: RefinedFits, added_px2: float) -> Ref
     if estimator.single.any():
         single = States.at_rest(fits.states.R, fits.states.p, START_SIGMAS_SINGLE)
         starts = starts.with_rows(estimator.single, single.select(estimator.single))
-    seen = fits.observations
-    observations = MatchedObservations.of_discs(seen.detections.with_noise(added_px2), seen.discs)
-    fit = estimator.fit(estimator.predict(starts, np.full(len(starts), START_S)), observations, SMALL)
+    prediction = estimator.predict(starts, np.full(len(starts), START_S))
+    observations = estimator.linearized(prediction.states, fits.observations.with_noise(added_px2))
+    fit = estimator.fit(prediction, observations, SMALL)
     return replace(
-        fits, states=fit.states, observations=observations, equations=fit.equations, weights=fit.weights
+        fits,
+        states=fit.states,
+        observations=observations.matched,
+        equations=fit.equations,
+        weights=fit.weights,
     )
 
 

@@ -19,25 +19,21 @@ Out inverses(const Covariances& information) {
     return covariances;
 }
 
-auto are_own(const In<double, -1, 2, 12>& A, const In<double, -1, 2>& nu, const Matrices2& cov,
-             const Numbers& log_density, const Index& body, const Index& camera, const Mask& certain,
-             const Covariances& information, const Index& of_body, const Index& of_camera, const Index& turn,
-             const Numbers& prior, const Numbers& added_px2) {
+auto are_own(const EquationArray& equations, const Matrices2& cov, const Numbers& log_density,
+             const Index& body, const Index& camera, const Mask& certain, const Covariances& information,
+             const Index& of_body, const Index& of_camera, const Index& turn, const Numbers& prior,
+             const Numbers& added_px2) {
     const size_t n = body.size(), n_asked = of_body.size();
-    require_equal(n, {A.shape(0), nu.shape(0), log_density.size(), camera.size(), certain.size()});
+    require_equal(n, {equations.shape(0), log_density.size(), camera.size(), certain.size()});
     require_equal(n_asked, {of_camera.size(), turn.size(), prior.size(), added_px2.size()});
-    const Evidence evidence{reinterpret_cast<const double (*)[2][kErrors]>(A.data()),
-                            reinterpret_cast<const double (*)[2]>(nu.data()),
-                            columns<4>(cov, n),
-                            log_density.data(),
-                            body.data(),
-                            camera.data()};
-    const Doubts doubts{below(information.shape(0), of_body),
-                        of_camera.data(),
-                        turn.data(),
-                        prior.data(),
-                        added_px2.data(),
-                        n_asked};
+    const size_t n_bodies = information.shape(0);
+    const Evidence evidence{
+        {reinterpret_cast<const Equations*>(equations.data()), below(n_bodies, body), n, n_bodies},
+        columns<4>(cov, n),
+        log_density.data(),
+        camera.data()};
+    const Doubts doubts{below(n_bodies, of_body), of_camera.data(), turn.data(), prior.data(),
+                        added_px2.data(),         n_asked};
     auto [own, to] = make<bool>({n});
     std::copy_n(certain.data(), n, to);
     accept(evidence, doubts, reinterpret_cast<const ErrorMatrix*>(information.data()), to);
@@ -104,12 +100,12 @@ auto predict_bodies(const BodyStates& bodies, const Covariances& P, const Number
 auto weigh_motions_of(const BodyStates& bodies, const Covariances& P, const Covariances& information,
                       const Numbers& dt, const In<double, -1, 2>& densities, const Mask& single,
                       const EquationArray& equations, const Index& body, const Index& camera,
-                      const Numbers& precision, const In<double, -1, kModels>& before,
+                      const Numbers& rig_share, const In<double, -1, kModels>& before,
                       const In<double, kModels>& shares) {
     const size_t n = bodies.size();
     require_equal(
         n, {P.shape(0), information.shape(0), dt.size(), densities.shape(0), single.size(), before.shape(0)});
-    require_equal(body.size(), {equations.shape(0), camera.size(), precision.size()});
+    require_equal(body.size(), {equations.shape(0), camera.size(), rig_share.size()});
     std::vector<MotionInterval> intervals;
     for (size_t b = 0; b < n; ++b) intervals.push_back({dt(b), densities(b, 0), densities(b, 1), single(b)});
     auto [probabilities, to_probabilities] = make({n, kModels});
@@ -124,7 +120,7 @@ auto weigh_motions_of(const BodyStates& bodies, const Covariances& P, const Cova
         intervals.data(),
         {reinterpret_cast<const Equations*>(equations.data()), below(n, body), body.size(), n},
         camera.data(),
-        precision.data()};
+        rig_share.data()};
     ModelNumbers of_declared;
     std::copy_n(shares.data(), kModels, of_declared.begin());
     std::vector<size_t> weighed;

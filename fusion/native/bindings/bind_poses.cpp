@@ -135,9 +135,9 @@ class ArrayFit {
     ArrayFit(const BodyStates& bodies, const CameraExposures& exposures, const DiscColumns& discs,
              const Pairs& xy, const Matrices2& whiten, const Mask& single, const Pairs& axes,
              const Numbers& angle, const Matrices2& scale, const Numbers& sigma, const Mask& shaped,
-             const Mask& turned, const Covariances& information)
+             const Mask& turned, const EquationArray& predicted, const Covariances& information)
         : discs_(discs),
-          columns_(xy, whiten, single, axes, angle, scale, sigma, shaped, turned, information),
+          columns_(xy, whiten, single, axes, angle, scale, sigma, shaped, turned, predicted, information),
           fit_(bodies, exposures, observed(bodies.size(), exposures.size()),
                reinterpret_cast<const ErrorMatrix*>(information.data())) {}
 
@@ -193,19 +193,23 @@ class ArrayFit {
         return array;
     }
     FitObservations observed(size_t n_bodies, size_t n_frames) const {
-        const auto& [xy, whiten, single, axes, angle, scale, sigma, shaped, turned, information] = columns_;
+        const auto& [xy, whiten, single, axes, angle, scale, sigma, shaped, turned, predicted, information] =
+            columns_;
         const Discs discs = discs_of(n_frames, n_bodies, discs_);
         const size_t n = discs.size();
         require_equal(n_bodies, {single.size(), information.shape(0)});
-        require_equal(n, {angle.size(), sigma.size(), shaped.size(), turned.size()});
+        require_equal(n, {angle.size(), sigma.size(), shaped.size(), turned.size(), predicted.shape(0)});
         return {{discs, columns<2>(xy, n), columns<4>(whiten, n), single.data()},
+                reinterpret_cast<const Equations*>(predicted.data()),
                 {discs, columns<2>(axes, n), angle.data(), columns<4>(scale, n), sigma.data()},
                 shaped.data(),
                 turned.data()};
     }
 
     DiscColumns discs_;
-    std::tuple<Pairs, Matrices2, Mask, Pairs, Numbers, Matrices2, Numbers, Mask, Mask, Covariances> columns_;
+    std::tuple<Pairs, Matrices2, Mask, Pairs, Numbers, Matrices2, Numbers, Mask, Mask, EquationArray,
+               Covariances>
+        columns_;
     BodyFit fit_;
 };
 
@@ -294,7 +298,7 @@ void bind_poses(nb::module_& m) {
     nb::class_<ArrayFit>(m, "BodyFit")
         .def(nb::init<const BodyStates&, const CameraExposures&, const DiscColumns&, const Pairs&,
                       const Matrices2&, const Mask&, const Pairs&, const Numbers&, const Matrices2&,
-                      const Numbers&, const Mask&, const Mask&, const Covariances&>())
+                      const Numbers&, const Mask&, const Mask&, const EquationArray&, const Covariances&>())
         .def("linearize", &ArrayFit::linearize)
         .def("step", &ArrayFit::step)
         .def("estimates", &ArrayFit::estimates)

@@ -93,8 +93,9 @@ def test_a_fit_is_reweighted_least_squares_of_the_bodies_that_still_move():
     shape = seen.detections.axes_px, seen.detections.angle_rad, seen.detections.scale, sigma
     prior, headings = np.tile(3 * np.eye(12), (BODIES, 1, 1)), random.normal(size=(turned.sum(), 2, 13))
     frames = ARRAY.exposed(exposures)
+    predicted = ARRAY.frame_poses(states, exposures).linearize_centres(discs.columns, xy, whiten, single)
     fit = _core.BodyFit(
-        states.bodies, frames, discs.columns, xy, whiten, single, *shape, shaped, turned, prior
+        states.bodies, frames, discs.columns, xy, whiten, single, *shape, shaped, turned, predicted, prior
     )
     owner = np.concatenate([discs.body, discs.body[shaped], discs.body[turned]])
     delta, moving, weights = np.zeros((BODIES, 12)), np.unique(owner), np.ones(len(owner))
@@ -153,7 +154,8 @@ def test_assignments_are_own_that_are_more_probable_than_other_roundels(added_px
     root, noise = random.normal(size=(3, 12, 20)), random.normal(size=(n, 2, 4))
     P, cov = root @ root.transpose(0, 2, 1), noise @ noise.transpose(0, 2, 1)
     whiten = np.linalg.inv(np.linalg.cholesky(cov))
-    evidence = whiten @ J, (whiten @ nu_px[..., None])[..., 0], np.moveaxis(cov, 0, 2).copy(), log_density
+    whitened = whiten @ np.concatenate([J, nu_px[..., None]], axis=2)
+    evidence = whitened, np.moveaxis(cov, 0, 2).copy(), log_density
 
     def judged(of_body: Index, of_camera: Index, turn: Index, prior: Array) -> Mask:
         doubts = of_body, of_camera, turn, prior, np.full(len(prior), added_px2)

@@ -90,7 +90,7 @@ CALLS = {
         ).linearize(given[-1]),
         (
             *(*BODY_ARRAYS, *EXPOSURE_ARRAYS, *DISC_ARRAYS, np.zeros((2, N)), SCALES, FALSE, *OUTLINES),
-            *(np.ones(N, bool), np.ones(N, bool), P, np.zeros((N, 2, 13))),
+            *(np.ones(N, bool), np.ones(N, bool), np.zeros((N, 2, 13)), P, np.zeros((N, 2, 13))),
         ),
     ),
     "whiten": (_core.whiten, (SCALES, SCALES)),
@@ -98,7 +98,7 @@ CALLS = {
     "are_own": (
         _core.are_own,
         (
-            *(np.ones((N, 2, 12)), np.ones((N, 2)), SCALES, np.ones(N), BODY, FRAME, np.zeros(N, bool), P),
+            *(np.ones((N, 2, 13)), SCALES, np.ones(N), BODY, FRAME, np.zeros(N, bool), P),
             *(BODY, FRAME, FRAME, np.zeros(N), np.zeros(N)),
         ),
     ),

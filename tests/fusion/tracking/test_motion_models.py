@@ -73,15 +73,15 @@ def test_models_are_weighed_by_the_likelihood_of_the_detections(n: int):
     dt, single = np.array([0.03]), np.array([False])
     by_share = [predict(start, dt, share * DENSITIES, single)[0] for share in SHARES]
     equations = rng.normal(size=(n, 2, 13)) * np.r_[np.full(6, 100.0), np.full(6, 1.0), 3.0]
-    cameras, precision = np.arange(n) % 2, rng.uniform(1.0, 2.0, n)
-    A, b = equations[..., :12].reshape(-1, 12), (equations[..., 12] * precision[:, None]).ravel()
+    cameras, rig_share = np.arange(n) % 2, rng.uniform(0.0, 0.75, n)
+    A, b = equations[..., :12].reshape(-1, 12), (equations[..., 12] / np.sqrt(1 - rig_share)[:, None]).ravel()
     densities = [
         multivariate_normal.pdf(b, cov=np.eye(len(b)) + A @ states.P[0] @ A.T) for states in by_share
     ]
     before = np.array([[0.1, 0.2, 0.3, 0.4]])
     declared = by_share[0]
     scene = declared.bodies, declared.P, _core.inverses(declared.P), dt, DENSITIES, single
-    seen = equations, np.zeros(n, np.intp), cameras, precision
+    seen = equations, np.zeros(n, np.intp), cameras, rig_share
     after, P, information, rows = _core.weigh_motions(*scene, *seen, before, SHARES)
     assert rows.tolist() == [0]
     expected = before[0] * densities / (before[0] @ densities)
@@ -98,7 +98,7 @@ def test_a_body_moves_as_declared(n: int):
     declared, _ = predict(start, dt, DENSITIES, single)
     information, before = _core.inverses(declared.P), np.full((1, len(SHARES)), 1 / len(SHARES))
     scene = declared.bodies, declared.P, information, dt, DENSITIES, single
-    seen = np.ones((n, 2, 13)), np.zeros(n, np.intp), np.full(n, 3), np.ones(n)
+    seen = np.ones((n, 2, 13)), np.zeros(n, np.intp), np.full(n, 3), np.zeros(n)
     after, P, inverse, rows = _core.weigh_motions(*scene, *seen, before, SHARES)
     assert not len(rows)
     assert np.array_equal(after, before)
