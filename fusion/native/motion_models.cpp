@@ -22,15 +22,15 @@ struct ReducedObservations {
     ErrorVector z{};
 };
 
-/// Adds equations whose right sides are times `precision`.
-ROUNDEL_CLONES void add(const Equations& equations, double precision, ErrorMatrix& H, ErrorVector& g) {
-    for (const auto& row : equations.A)
-        for (int i = 0; i < kErrors; ++i) {
-            for (int j = 0; j < kErrors; ++j) H[i][j] += row[i] * row[j];
-            g[i] += row[i] * (precision * row[kErrors]);
-        }
+/// The equations with innovations in standard deviations of the detection's own noise, of whose variance the
+/// share `of_rig` counts the errors of its camera.
+Equations with_own_noise(Equations equations, double of_rig) {
+    const double precision = 1 / std::sqrt(std::max(1 - of_rig, kLeastOwn));
+    for (auto& row : equations.A) row[kErrors] *= precision;
+    return equations;
 }
 
+/// Of the lower triangle of H.
 ROUNDEL_CLONES ReducedObservations reduce(ErrorMatrix H, ErrorVector g) {
     ReducedObservations to;
     const ErrorMatrix whole = H;
@@ -48,14 +48,14 @@ ROUNDEL_CLONES ReducedObservations reduce(ErrorMatrix H, ErrorVector g) {
     return to;
 }
 
-/// G^T P G.
+/// G^T P G of a lower triangular G.
 ROUNDEL_CLONES ErrorMatrix congruent(const ErrorMatrix& G, const ErrorMatrix& P) {
     ErrorMatrix half{}, whole{};
     for (int i = 0; i < kErrors; ++i)
         for (int k = 0; k < kErrors; ++k)
             for (int j = 0; j < kErrors; ++j) half[i][j] += P[i][k] * G[k][j];
-    for (int i = 0; i < kErrors; ++i)
-        for (int j = 0; j < kErrors; ++j)
+    for (int j = 0; j < kErrors; ++j)
+        for (int i = j; i < kErrors; ++i)
             for (int k = 0; k < kErrors; ++k) whole[j][k] += G[i][j] * half[i][k];
     return whole;
 }
@@ -106,6 +106,7 @@ std::vector<size_t> weigh_motions(const PredictedBodies& predicted, const ModelN
                                   double* probabilities, ErrorMatrix* P, ErrorMatrix* information) {
     const ByBody of(predicted.observed);
     std::vector<size_t> weighed;
+    std::vector<Equations> equations;
     ModelNumbers less, costs;  // of the declared densities, all of which are in P
     for (int m = 0; m < kModels; ++m) less[m] = shares[m] - 1;
     for (size_t b = 0; b < predicted.observed.n_bodies; ++b) {
@@ -114,9 +115,10 @@ std::vector<size_t> weigh_motions(const PredictedBodies& predicted, const ModelN
         if (std::none_of(begin, end, is_of_another)) continue;
         ErrorMatrix H{};
         ErrorVector g{};
+        equations.clear();
         for (const size_t* k = begin; k < end; ++k)
-            add(predicted.observed.equations[*k],
-                1 / std::sqrt(std::max(1 - predicted.rig_share[*k], kLeastOwn)), H, g);
+            equations.push_back(with_own_noise(predicted.observed.equations[*k], predicted.rig_share[*k]));
+        add(equations, std::vector(equations.size(), 1.0), H, g);
         const auto [G, z] = reduce(H, g);
         const ErrorMatrix noise = process_noise(predicted.bodies[b], predicted.intervals[b]);
         ErrorMatrix S = congruent(G, predicted.P[b]);

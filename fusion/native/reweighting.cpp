@@ -14,6 +14,7 @@
 namespace roundel::fusion {
 namespace {
 
+constexpr double kSingular = 1e-12;  // of a pivot to its element before
 constexpr int kMaxReweightings = 4;  // for one linearization; one is usual
 constexpr double kConverged = 0.1;   // changes of weights below this are not applied
 
@@ -34,17 +35,7 @@ inline void add_strip(const double* a, const double* b, double weight, ErrorMatr
     }
 }
 
-ROUNDEL_CLONES void add(BodySums& sums) {
-    for (size_t k = 0; k < sums.equations.size(); ++k) {
-        const Equations equations = sums.equations[k];  // a copy, which cannot alias the sums
-        const double *a = equations.A[0], *b = equations.A[1], weight = sums.weights[k];
-        add_strip<0>(a, b, weight, sums.H);
-        add_strip<4>(a, b, weight, sums.H);
-        add_strip<8>(a, b, weight, sums.H);
-        for (int i = 0; i < kErrors; ++i)
-            sums.g[i] += weight * a[i] * a[kErrors] + weight * b[i] * b[kErrors];
-    }
-}
+void add(BodySums& sums) { add(sums.equations, sums.weights, sums.H, sums.g); }
 
 ErrorVector solve(const ErrorMatrix& H, const ErrorVector& g) {
     const Cholesky<kErrors> factor(H);
@@ -89,6 +80,18 @@ void reweigh_body(BodySums& sums) {
 }
 
 }  // namespace
+
+ROUNDEL_CLONES void add(const std::vector<Equations>& equations, const std::vector<double>& weights,
+                        ErrorMatrix& H, ErrorVector& g) {
+    for (size_t k = 0; k < equations.size(); ++k) {
+        const Equations rows = equations[k];  // a copy, which cannot alias the sums
+        const double *a = rows.A[0], *b = rows.A[1], weight = weights[k];
+        add_strip<0>(a, b, weight, H);
+        add_strip<4>(a, b, weight, H);
+        add_strip<8>(a, b, weight, H);
+        for (int i = 0; i < kErrors; ++i) g[i] += weight * a[i] * a[kErrors] + weight * b[i] * b[kErrors];
+    }
+}
 
 ByBody::ByBody(const EquationSystem& system) : first(system.n_bodies + 1), indices(system.n_equations) {
     for (size_t k = 0; k < system.n_equations; ++k) ++first[system.body[k] + 1];
@@ -200,9 +203,22 @@ void accept(const Evidence& evidence, const Doubts& doubts, const ErrorMatrix* i
     }
 }
 
-std::optional<ErrorMatrix> inverse_if_positive(const ErrorMatrix& H) {
-    const Cholesky<kErrors> factor(H);
-    return factor.positive() ? std::optional(factor.inverse_tail<kErrors>()) : std::nullopt;
+ROUNDEL_CLONES std::optional<ErrorMatrix> inverse_if_positive(const ErrorMatrix& H) {
+    ErrorMatrix A = H;
+    for (int k = 0; k < kErrors; ++k) {
+        const double pivot = A[k][k];
+        if (!(pivot > kSingular * H[k][k])) return std::nullopt;
+        const double per_root = 1 / std::sqrt(pivot);
+        ErrorVector scaled = A[k];
+        for (double& x : scaled) x *= per_root;
+        for (int i = 0; i < kErrors; ++i)
+            for (int j = 0; j < kErrors; ++j) A[i][j] -= scaled[i] * scaled[j];
+        for (int j = 0; j < kErrors; ++j) A[k][j] = A[j][k] = scaled[j] * per_root;
+        A[k][k] = -1 / pivot;
+    }
+    for (ErrorVector& row : A)
+        for (double& x : row) x = -x;
+    return A;
 }
 
 ErrorMatrix inverse(const ErrorMatrix& H) {

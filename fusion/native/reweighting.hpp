@@ -30,6 +30,10 @@ struct ByBody {
     explicit ByBody(const EquationSystem& system);
 };
 
+/// Adds weighted equations of one body to the lower triangle of their matrix, and to the right side.
+void add(const std::vector<Equations>& equations, const std::vector<double>& weights, ErrorMatrix& H,
+         ErrorVector& g);
+
 /// Adds priors and weighted equations: iteratively reweighted least squares (Holland and Welsch 1977) with
 /// Cauchy weights, until the weights of a body converge.
 ///
@@ -63,7 +67,7 @@ struct Doubts {
 /// images, given those that are certain and the information of the predictions, by body.
 void accept(const Evidence& evidence, const Doubts& doubts, const ErrorMatrix* information, bool* certain);
 
-/// The inverse of a positive definite matrix.
+/// The inverse of a positive definite matrix, by symmetric sweeps (Goodnight 1979).
 std::optional<ErrorMatrix> inverse_if_positive(const ErrorMatrix& H);
 
 /// The same; throws std::runtime_error for other matrices.
