@@ -139,6 +139,7 @@ class CameraArray:
         R_cam_world: (C, 3, 3).
         centres: (C, 3) centres of projection, world frame.
         focal: (C,) mean focal lengths, pixels.
+        height: (C,) rows of the images.
         area_px2: (C,) of the images.
         covariance: (8 C, 8 C) of the errors of the cameras, which claims contain; see `calib.rig.camera_errors`.
         error_px: (C,) what these errors displace in the images, RMS of a coordinate, at most `MAX_ERROR_PX`: by these,
@@ -196,6 +197,7 @@ class CameraArray:
         self.R_cam_world = np.ascontiguousarray(T[:, :3, :3].transpose(0, 2, 1))
         self.centres = np.ascontiguousarray(T[:, :3, 3])
         self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
+        self.height = np.array([camera.height for camera in cameras])
         self.area_px2 = np.array([camera.width * camera.height for camera in cameras], float)
         of_size = self.size_error * errors_of_size(T)
         self.covariance = self.error_scale**2 * error_covariance(list(cameras)) + np.outer(of_size, of_size)
@@ -332,17 +334,16 @@ class DetectionTable(Columns):
     def of(cls, frame_set: FrameSet, cameras: CameraArray) -> "DetectionTable":
         """The detections of a frame set; errors of the cameras are added to the noise that detectors report."""
         frames = frame_set.frames
-        exposures = Exposures(
-            np.array([cameras.index[frame.camera] for frame in frames], np.intp),
-            np.array([(frame.t_ns - frame_set.t_ns) * 1e-9 for frame in frames]),
-            np.array([frame.clock_sigma_s for frame in frames]),
-            np.array([frame.stamp_sigma_s for frame in frames]),
-            np.array([frame.readout_s / cameras[frame.camera].height for frame in frames]),
-        )
+        camera = np.array([cameras.index[frame.camera] for frame in frames], np.intp)
+        times = [
+            (1e-9 * (f.t_ns - frame_set.t_ns), f.clock_sigma_s, f.stamp_sigma_s, f.readout_s) for f in frames
+        ]
+        tau, clock_sigma, stamp_sigma, readout_s = np.array(times).reshape(-1, 4).T.copy()
+        exposures = Exposures(camera, tau, clock_sigma, stamp_sigma, readout_s / cameras.height[camera])
         counts = [frame.columns.shape[1] for frame in frames]
         row = np.repeat(np.arange(len(frames)), counts)
         columns = np.concatenate([np.empty((N_ROWS, 0)), *(frame.columns for frame in frames)], axis=1)
-        columns[COV][::3] += (cameras.error_px**2)[exposures.camera[row]]
+        columns[COV][::3] += (cameras.error_px**2)[camera[row]]
         if exposures.line_s.any():
             columns[DELAY] = np.concatenate([frame.delays(cameras[frame.camera]) for frame in frames])
         return cls(exposures, row, columns)

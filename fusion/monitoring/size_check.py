@@ -65,11 +65,12 @@ class SizeCheck:
         unit_m = np.linalg.norm(decompose(seen.conics(), 1.0)[0], axis=2).mean(1)
         range_m = np.linalg.norm(position[known] - self._cameras.centres[seen.camera], axis=1)
         log_ratio = np.log(2 * range_m / unit_m / self._diameters[robot])
-        for k, value in zip(robot.tolist(), log_ratio.tolist(), strict=True):
-            if np.isfinite(value):
-                self._count[k] += 1
-                bounded = min(max(value, -MAX_LOG_RATIO), MAX_LOG_RATIO)
-                self._mean_log[k] += (bounded - self._mean_log[k]) / min(self._count[k], MIN_MEASURED)
+        measured, n = np.isfinite(log_ratio), len(self._count)
+        robot, bounded = robot[measured], np.clip(log_ratio[measured], -MAX_LOG_RATIO, MAX_LOG_RATIO)
+        count = np.bincount(robot, minlength=n)
+        self._count += count
+        remembered = np.maximum(np.minimum(self._count, MIN_MEASURED), np.maximum(count, 1))
+        self._mean_log += (np.bincount(robot, bounded, n) - count * self._mean_log) / remembered
 
     def misfits(self) -> dict[str, float]:
         """Measured diameters, metres, of robots with another declared one; logs each robot when it first appears."""

@@ -20,16 +20,15 @@ struct ViewSums {
 /// Adds the equations k of a body to the sums of their frame, and to what is counted for the cameras.
 ROUNDEL_CLONES void add(const WeightedEquations& observed, size_t k, ViewSums& view, ErrorMatrix& counted) {
     const Equations equations = observed.system.equations[k];  // a copy, which cannot alias the sums
-    for (int a = 0; a < 2; ++a) {
-        const double *row = equations.A[a], weight = observed.weights[k];
-        const double by_focal = observed.whiten.at(2 * a, k) * observed.xy.at(0, k) +
-                                observed.whiten.at(2 * a + 1, k) * observed.xy.at(1, k);
-        for (int i = 0; i < kErrors; ++i) {
-            const double scaled = weight * row[i], shared = scaled * observed.rig_share[k];
-            for (int j = 0; j < kPoseErrors; ++j) view.by_pose[i][j] += scaled * row[j];
-            for (int j = 0; j < kErrors; ++j) counted[i][j] += shared * row[j];
-            view.by_focal[i] += scaled * by_focal;
-        }
+    const double *u = equations.A[0], *v = equations.A[1], weight = observed.weights[k];
+    const double x = observed.xy.at(0, k), y = observed.xy.at(1, k), shared = observed.rig_share[k];
+    const double u_focal = observed.whiten.at(0, k) * x + observed.whiten.at(1, k) * y;
+    const double v_focal = observed.whiten.at(2, k) * x + observed.whiten.at(3, k) * y;
+    for (int i = 0; i < kErrors; ++i) {
+        const double by_u = weight * u[i], by_v = weight * v[i];
+        for (int j = 0; j < kPoseErrors; ++j) view.by_pose[i][j] += by_u * u[j] + by_v * v[j];
+        for (int j = 0; j < kErrors; ++j) counted[i][j] += shared * (by_u * u[j] + by_v * v[j]);
+        view.by_focal[i] += by_u * u_focal + by_v * v_focal;
     }
 }
 

@@ -373,5 +373,5 @@ class OwnDetections:
             column[~expected] = 0
         self._unseen = np.where(known, count == 0, self._unseen)
         self._learned += known
-        rate = known / np.clip(self._learned, 1, LEARNED)
+        rate = known / np.maximum(np.minimum(self._learned, LEARNED), 1)
         self._usual += rate * (count / np.maximum(frames, 1) - self._usual)

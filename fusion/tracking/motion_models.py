@@ -82,5 +82,5 @@ class MotionModels:
             SHARES,
         )
         risen = (self.probabilities[rows] - before[rows]) @ np.log(SHARES)
-        self.is_sudden = bool(len(rows)) and bool(np.median(risen) > -np.log(SHARES[1]))
+        self.is_sudden = bool(2 * np.sum(risen > -np.log(SHARES[1])) > len(rows))
         return Prediction(replace(states, P=P), information, prediction.motion)

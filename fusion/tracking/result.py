@@ -239,8 +239,10 @@ def _column(dtype: str, labeled: NDArray, unlabeled: NDArray) -> bytes:
 
 def _packed(seen: Mask) -> NDArray[np.uint64]:
     """(K,) bit masks of (K, C)."""
-    n = min(seen.shape[1], MAX_CAMERAS)
-    return seen[:, :n].astype(np.uint64) @ (np.uint64(1) << np.arange(n, dtype=np.uint64))
+    of_bytes = np.packbits(seen[:, :MAX_CAMERAS], axis=1, bitorder="little")
+    bits = np.zeros((len(seen), MAX_CAMERAS // 8), np.uint8)
+    bits[:, : of_bytes.shape[1]] = of_bytes
+    return bits.view("<u8")[:, 0]
 
 
 def _bits(cameras: Index) -> int:

@@ -84,7 +84,9 @@ class SingleViewTracker:
         distance = np.linalg.norm(seen.xy[:, :, None] - last.xy[:, None], axis=0)
         same = (seen.camera[:, None] == last.camera) & (distance < reach)
         count = 1 + np.max(np.where(same, last.count, 0), axis=1, initial=0)
-        old = ~np.isin(last.camera, seen.exposures.camera) & (t_ns - last.t_ns < FORGET_NS)
+        is_silent = np.ones(len(self._cameras.names), bool)
+        is_silent[seen.exposures.camera] = False
+        old = is_silent[last.camera] & (t_ns - last.t_ns < FORGET_NS)
         self._spots = _Spots(
             np.concatenate([last.camera[old], seen.camera]),
             np.concatenate([last.xy[:, old], seen.xy], axis=1),
