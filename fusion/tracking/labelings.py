@@ -111,11 +111,12 @@ def find_labelings(
         robot: (K,) of the pairs.
         chosen: columns of `pairs`.
     """
-    frame, n = detections.frame[pairs[1]], np.max(robot, initial=0) + 1
+    n = np.max(robot, initial=0) + 1
     of_detection = pairs[1] * n + robot
     shared = np.bincount(of_detection)[of_detection] > 1
     if not shared.any():
         return Labelings.none()
+    frame = detections.frame[pairs[1]]
     cost = cost + 3 * np.log(2 * np.pi) - unpaired_cost(cameras, detections)[frame]
     view = frame * n + robot
     owner = np.full(len(detections), -1)

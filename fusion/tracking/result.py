@@ -229,7 +229,8 @@ def camera_use(
     n_used = np.bincount(camera[used], minlength=n).tolist()
     n_unused = np.bincount(camera[~used], minlength=n).tolist()
     of_assigned = camera[assignments.detection]
-    squares = np.bincount(of_assigned, np.nan_to_num(assignments.squared_px), n).tolist()
+    squared_px = np.where(np.isnan(assignments.squared_px), 0.0, assignments.squared_px)
+    squares = np.bincount(of_assigned, squared_px, n).tolist()
     return {name: CameraUse(n_used[k], n_unused[k], squares[k]) for k, name in enumerate(cameras.names)}
 
 

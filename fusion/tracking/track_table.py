@@ -247,5 +247,6 @@ class TrackTable:
         """(N,) robots with a position sigma above `tracked_sigma_m` in some direction, by covariances (N, 12, 12)."""
         position, limit = covariance[:, POSITION, POSITION], self._limits.tracked_sigma_m**2
         uncertain = np.einsum("nii->n", position) > limit  # the trace bounds every eigenvalue
-        uncertain[uncertain] = np.linalg.eigvalsh(position[uncertain])[:, -1] > limit
+        if uncertain.any():
+            uncertain[uncertain] = np.linalg.eigvalsh(position[uncertain])[:, -1] > limit
         return uncertain
