@@ -62,10 +62,12 @@ def refusal(message: Detections, cameras: Mapping[str, Camera]) -> Refusal | Non
 
 @dataclass(slots=True)
 class _FrameHistory:
-    """Whether each sequence number of the last frames of a camera was not above the previous one."""
+    """The last sequence number of a camera, how many frames it sent, and which of them had a number that was not above
+    the one before."""
 
-    steps_back: deque[bool] = field(default_factory=lambda: deque(maxlen=HISTORY))
     seq: int = -1
+    n: int = 0
+    steps_back: deque[int] = field(default_factory=lambda: deque(maxlen=MIN_STEPS_BACK))
 
 
 class Ingest:
@@ -146,9 +148,12 @@ class Ingest:
         """Report two publishers of one name: where nodes do not say who they are, sequence numbers that alternate show
         them."""
         history = self._histories[message.camera]
-        history.steps_back.append(message.seq <= history.seq)
+        history.n += 1
+        if message.seq <= history.seq:
+            history.steps_back.append(history.n)
         history.seq = message.seq
-        has_two = self._publishers.is_contested(message.camera) or sum(history.steps_back) >= MIN_STEPS_BACK
+        alternates = len(history.steps_back) == MIN_STEPS_BACK and history.n - history.steps_back[0] < HISTORY
+        has_two = alternates or self._publishers.is_contested(message.camera)
         self._statistics.note_publishers(message.camera, has_two)
 
 
