@@ -91,6 +91,18 @@ def value_of(view: View, label: str) -> Any:
     return next(handle.value for handle in handles if getattr(handle, "label", None) == label)
 
 
+def set_checkbox(page: Page, view: View, label: str, checked: bool = True) -> None:
+    """Click the checkbox after a label until the page's process has its value. Its input lies below what is drawn,
+    so Playwright can't wait for it to be still, and a click misses it while the page moves."""
+    box = page.locator(f"xpath=//*[text()='{label}']/following::input[@type='checkbox'][1]")
+
+    def click() -> None:
+        if box.is_checked() != checked:
+            box.click(force=True)
+
+    wait_for(lambda: value_of(view, label) == checked, click)
+
+
 @functools.cache
 def _start_chromium(program: str) -> Callable[[], Browser]:
     """Start Chromium; each call of the result is a connection to it, which closes what was opened by it alone."""

@@ -15,7 +15,7 @@ from camera_node.protocol.registration import CameraChange, RegisteredCameras, c
 from camera_node.protocol.requests import encode_jpeg
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from tests.web.browser import browsing, value_of
+from tests.web.browser import browsing, set_checkbox, value_of
 from web.view import View
 
 ROUNDEL = (320.0, 240.0)
@@ -97,12 +97,10 @@ def test_pictures_and_settings_of_a_camera(arena: LiveArena, view: View, east: S
         page.get_by_text("east: 1 masked places").wait_for()
         page.get_by_role("button", name="Remove the mask").click()
         page.get_by_text("east: 0 masked places").wait_for()
-        for box in ("Show what the cameras see", "Live pictures"):
-            checkbox = f"xpath=//*[text()='{box}']/following::input[@type='checkbox'][1]"
-            page.locator(checkbox).click(force=True)
+        set_checkbox(page, view, "Show what the cameras see")
+        set_checkbox(page, view, "Live pictures", False)
         wait_for(lambda: not page.locator("img[alt=east]").count(), speak)
         wait_for(lambda: not is_matched(publisher))
-    assert value_of(view, "Show what the cameras see")
     assert east.changes[0].exposure_us == 3000.0
     polygon = np.array(east.changes[2].mask)[0]
     assert cv2.pointPolygonTest(polygon.astype(np.float32), ROUNDEL, False) > 0

@@ -20,7 +20,7 @@ from tests.conftest import ROOT
 from tests.fusion.unknown_robot import serving_an_unknown_robot
 from tests.waiting import wait_for
 from tests.web.arena import LiveArena
-from tests.web.browser import browsing, drawing, loopback, value_of
+from tests.web.browser import browsing, drawing, loopback, set_checkbox, value_of
 from web.condition import Condition
 from web.html_tables import HtmlTable
 from web.page import add_live_page
@@ -69,8 +69,7 @@ def test_a_recording_is_made_shown_exported_renamed_and_deleted(view: View, tmp_
         page.get_by_role("cell", name=summary.path.name).wait_for()
         page.get_by_role("button", name="Replay").click()
         page.get_by_text(f"recording {summary.path.name}:").wait_for()
-        page.locator("xpath=//*[text()='Loop']/following::input[@type='checkbox'][1]").click(force=True)
-        wait_for(lambda: value_of(view, "Loop"))
+        set_checkbox(page, view, "Loop")
         page.get_by_role("button", name="Pause").click()
         page.get_by_role("button", name="Step").click()
         page.get_by_role("button", name="Play", exact=True).wait_for()

@@ -15,7 +15,7 @@ from fusion.model.robots import turn_heading
 from tests.fusion.serving import config, serving
 from tests.fusion.synthetic import TRIANGLE, WIDE
 from tests.waiting import wait_for
-from tests.web.browser import browsing, drawing, loopback, value_of
+from tests.web.browser import browsing, drawing, loopback, set_checkbox
 from web.page import TABS, add_live_page
 from web.state.feed import Feed
 from web.state.subscription import Subscription
@@ -128,10 +128,7 @@ def test_robots_are_selected_together_and_keys_act(arena: tuple[Client, View]):
         page.get_by_text("Several robots").click()
         page.get_by_role("button", name="a", exact=True).click()
         page.get_by_text("selected: a", exact=True).wait_for()
-        page.get_by_text("Show only the selected robots").locator(
-            "xpath=following::input[@type='checkbox'][1]"
-        ).click(force=True)
-        wait_for(lambda: value_of(view, "Show only the selected robots"))
+        set_checkbox(page, view, "Show only the selected robots")
         assert (view.robots.is_shown("a"), view.robots.is_shown("b")) == (True, False)
         page.get_by_role("button", name="Select all or none").click()
         page.get_by_text("selected: none").wait_for()
