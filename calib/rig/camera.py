@@ -25,6 +25,7 @@ PER_CAMERA = 18
 FOCAL_STABILITY, CENTRE_STABILITY, DISTORTION_STABILITY = 5e-4, 0.3, (5e-4, 2e-4, 2e-5, 2e-5, 2e-4)
 
 MIN_MARKERS = 4  # of a view, that give a body's pose
+NEAREST_M = 1e-3  # a marker nearer to its camera counts as behind it: inside a lens it would fit any pixel
 FLAT = 0.01  # of the extent of points: those nearer to a line or a plane lie on it
 
 

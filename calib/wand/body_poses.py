@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from calib.rig.camera import FLAT, MIN_MARKERS, solve_view, span_dimension, transform
+from calib.rig.camera import FLAT, MIN_MARKERS, NEAREST_M, solve_view, span_dimension, transform
 from calib.rig.coverage import spread_evenly
 from calib.rig.estimation import MARGIN, STEPS
 from calib.wand.detections import MarkerTrack, WandDetections
@@ -36,7 +36,6 @@ SIGMA_RAD = 1.5e-3  # of a ray to a marker by a rough rig: 3 px of a lens of 200
 MOVING_RAD = 5e-3
 GATE = 5  # sigmas: a ray farther from its marker is an outlier
 TOLERANCE = 0.01  # the least gain of the cost in a step
-BEHIND = 1e-3  # m: a marker nearer to the camera, or behind it, counts as this far
 SWEEPS = 3  # in which all cameras are located in turn by the body
 FRAMES = 200  # of a camera, that place it
 TRIALS = 1000  # of RANSAC
@@ -223,7 +222,7 @@ class BodyLocator:
         """(n, 3) the markers in the cameras' frames, and (n, 2) their image plane coordinates."""
         motions = (self.inverse[:, None] @ poses[None])[views.camera, owner]
         p = (motions[:, :3, :3] @ self.points[views.marker][..., None])[..., 0] + motions[:, :3, 3]
-        p[:, 2] = np.where(p[:, 2] > BEHIND, p[:, 2], BEHIND)
+        p[:, 2] = np.where(p[:, 2] > NEAREST_M, p[:, 2], NEAREST_M)  # behind the camera too
         return p, p[:, :2] / p[:, 2:]
 
     def _residuals(self, poses: Array, views: _Views, owner: Index) -> tuple[Array, Array]:

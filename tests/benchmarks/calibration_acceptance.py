@@ -89,8 +89,7 @@ class Recorded:
             raise CalibrationError(f"{layout} has no times")
         with tempfile.TemporaryDirectory() as name, contextlib.redirect_stdout(io.StringIO()):
             folder = Path(name)
-            LAYOUTS[layout](folder, self.rig, self.wand, self.messages)
-            files = (folder,) if layout == "caliscope" else (folder / "profile.txt", folder / "xypts.csv")
+            files = LAYOUTS[layout](folder, self.rig, self.wand, self.messages)
             ImportData(format=layout, files=files, out=folder).run()
             rig = load_rig(folder / "rig.yaml")
             sizes = {camera: (lens.width, lens.height) for camera, lens in rig.cameras.items()}

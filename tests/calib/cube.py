@@ -7,10 +7,9 @@ import numpy as np
 
 from calib.rig.camera import transform
 from calib.rig.wand_file import WandBody
-from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.protocol.messages import Detections
-from tests.calib.synthetic import Arena, ring
+from tests.calib.synthetic import Arena, ring, see_points
 
 HALF, SIGMA_PX = 0.15, 0.2
 CORNERS = 0.8 * HALF * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
@@ -53,10 +52,8 @@ def wave(
             points, place = transform(T, CUBE.points), camera.matrix()[:3, 3] - T[:3, 3]
             chosen = choose(NORMALS @ T[:3, :3].T @ place / np.linalg.norm(place))
             uv = camera.project_world(points) + SIGMA_PX * rng.standard_normal((16, 2))
-            seen = np.flatnonzero(np.repeat(chosen, 4) & camera.sees(uv))
-            roundels = Roundels.from_points(uv[seen], SIGMA_PX, seen.astype(np.int32))
-            header = {"camera": name, "width": camera.width, "height": camera.height}
-            messages.append(Detections.pack(roundels, seq=seq, t_ns=t_ns, **header))
+            shown = np.repeat(chosen, 4)
+            messages.append(see_points(name, camera, uv, SIGMA_PX, shown, seq=seq, t_ns=t_ns))
     return messages
 
 

@@ -11,10 +11,11 @@ from calib.rig.rig import Rig
 from camera_node.geometry.body import Body
 from camera_node.protocol.messages import Detections
 
-Layout = Callable[[Path, Rig, Body, Sequence[Detections]], None]
+# Writes to a folder, and returns what to import.
+Layout = Callable[[Path, Rig, Body, Sequence[Detections]], tuple[Path, ...]]
 
 
-def write_caliscope(folder: Path, rig: Rig, wand: Body, messages: Sequence[Detections]) -> None:
+def write_caliscope(folder: Path, rig: Rig, wand: Body, messages: Sequence[Detections]) -> tuple[Path, ...]:
     """Write a session of Caliscope 0.11: cameras, the points of one object with their places on it, and times by each
     camera's own clock."""
     FORMATS["caliscope"].write(rig, folder, FORMATS["caliscope"].origin)
@@ -32,6 +33,7 @@ def write_caliscope(folder: Path, rig: Rig, wand: Body, messages: Sequence[Detec
         ]
     (folder / "xy_CHARUCO.csv").write_text("\n".join(rows) + "\n")
     (folder / "timestamps.csv").write_text("\n".join(times) + "\n")
+    return (folder,)
 
 
 def write_clicks(name: FormatName) -> Layout:
@@ -39,7 +41,7 @@ def write_clicks(name: FormatName) -> Layout:
     synchronous cameras, NaN where a point is not seen."""
     chosen = FORMATS[name]
 
-    def write(folder: Path, rig: Rig, wand: Body, messages: Sequence[Detections]) -> None:
+    def write(folder: Path, rig: Rig, wand: Body, messages: Sequence[Detections]) -> tuple[Path, ...]:
         cameras, points = list(rig.cameras), len(wand.points)
         table = np.full((1 + max(m.seq for m in messages), points, len(cameras), 2), np.nan)
         for message in messages:
@@ -51,6 +53,7 @@ def write_clicks(name: FormatName) -> Layout:
         rows = table.reshape(len(table), -1)
         np.savetxt(folder / "xypts.csv", rows, delimiter=",", header=",".join(header), comments="")
         chosen.write(rig, folder, chosen.origin)
+        return folder / "profile.txt", folder / "xypts.csv"
 
     return write
 

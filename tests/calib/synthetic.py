@@ -166,6 +166,17 @@ def record(arena: Arena, seconds: float = 10.0, **options: Any) -> list[Detectio
     return messages
 
 
+def see_points(
+    name: str, camera: Camera, uv: Array, sigma_px: float, shown: Mask | None = None, *, seq: int, t_ns: int
+) -> Detections:
+    """The frame of a camera with those of the pixels (M, 2) that lie in its image, numbered by their rows; of the
+    `shown` ones (M,) if these are given."""
+    seen = np.flatnonzero(camera.sees(uv) if shown is None else shown & camera.sees(uv))
+    roundels = Roundels.from_points(uv[seen], sigma_px, seen.astype(np.int32))
+    header = {"camera": name, "width": camera.width, "height": camera.height}
+    return Detections.pack(roundels, seq=seq, t_ns=t_ns, **header)
+
+
 def _detect(
     uv: Array, axes: Array, angles: Array, seen: Mask, options: DetectorOptions, rng: np.random.Generator
 ) -> Roundels:

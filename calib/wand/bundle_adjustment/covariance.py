@@ -298,12 +298,12 @@ def estimate_shares(information: Array, gradient: Array, sigma: Array, unknown: 
 def _integrate_out(information: Array, gradient: Array, others: Mask, sigma: Array) -> tuple[Array, Array]:
     """The information and gradient that remain of n parameters without the `others` (n,), whose priors have the
     deviations `sigma` (n,), which may be 0."""
-    S, kept = sigma[others], ~others
-    crossed = S[:, None] * information[others][:, kept]
+    S, rest = sigma[others], ~others
+    crossed = S[:, None] * information[others][:, rest]
     known = np.eye(len(S)) + S[:, None] * information[others][:, others] * S
     response = np.linalg.solve(known, np.column_stack([crossed, S * gradient[others]]))
-    remaining = information[kept][:, kept] - crossed.T @ response[:, :-1]
-    return remaining, gradient[kept] - crossed.T @ response[:, -1]
+    remaining = information[rest][:, rest] - crossed.T @ response[:, :-1]
+    return remaining, gradient[rest] - crossed.T @ response[:, -1]
 
 
 def _log_marginals(information: Array, gradient: Array, sigma: Array) -> Array:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.rig.camera import LENS, PER_CAMERA, POSE, pixel_jacobians
+from calib.rig.camera import LENS, NEAREST_M, PER_CAMERA, POSE, pixel_jacobians
 from calib.rig.estimation import CAUCHY_SCALE, STEPS, cauchy_cost, cauchy_weights, coordinate_sigma
 from calib.rig.triangulation import intersect_images
 from calib.wand.bundle_adjustment.problem import (
@@ -41,7 +41,6 @@ SPEED_SIGMA = 3.0  # metres per second of a hand
 SCALE_SIGMA = 1e-6  # relative, of a distance that fixes the scale
 STEP_SIGMA_M = 0.5  # of a position's change in one step: damps positions that too few cameras observe
 BEHIND = 1e4  # sigmas: the residual of a point behind its camera
-NEAREST_M = 1e-3  # a marker nearer to its camera counts as behind it: inside a lens it would fit any pixel
 POINT_STEPS = 3  # of Gauss-Newton: a point moves little while its cameras take one step
 # Relative information that is added to every coordinate: a point on parallel rays stays where it is.
 REGULAR = 1e-9

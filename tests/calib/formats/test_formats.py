@@ -22,15 +22,13 @@ from calib.rig.camera import transform
 from calib.rig.rig import Rig, load_rig, save_rig
 from calib.rig.wand_file import WandBody
 from calib.wand.calibrate import calibrate
-from camera_node.detection.roundels import Roundels
 from camera_node.foundation.errors import ConfigError
 from camera_node.geometry.lens import Lens
 from camera_node.geometry.pose import invert, rotation_from_wxyz
-from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import read_observations
 from tests.calib.foreign_layouts import write_caliscope
 from tests.calib.stick import LENGTH_M, STICK, write_stick
-from tests.calib.synthetic import camera_errors, ring
+from tests.calib.synthetic import camera_errors, ring, see_points
 
 EASYWAND_PROFILE = (
     "1 2857 2336 1728 1168 864 1\n2 2857 2336 1728 1168 864 1\n3 4000 2336 1728 1168 864 1.01\n"
@@ -302,11 +300,8 @@ def write_caliscope_session(folder: Path) -> Rig:
         at = transform(ring(4).wand_pose(1e-9 * t_ns), board.points)
         for name, camera in truth.cameras.items():
             uv = camera.project_world(at) + 0.1 * rng.standard_normal((12, 2))
-            seen = np.setdiff1d(np.flatnonzero(camera.sees(uv)), [5])
-            corners = Roundels.from_points(uv[seen], 0.1, seen.astype(np.int32))
-            header = {"width": camera.width, "height": camera.height}
             stamp = t_ns + 25_000_000_000
-            messages.append(Detections.pack(corners, camera=name, seq=seq, t_ns=stamp, **header))
+            messages.append(see_points(name, camera, uv, 0.1, np.arange(12) != 5, seq=seq, t_ns=stamp))
     write_caliscope(folder, truth, board, messages)
     (folder / "xyz_CHARUCO.csv").write_text(
         "sync_index,object_id,keypoint_id,x_coord,y_coord,z_coord,frame_time\n"

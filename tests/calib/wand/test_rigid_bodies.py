@@ -18,13 +18,12 @@ from calib.wand.calibrate import calibrate
 from calib.wand.detections import MarkerTrack
 from calib.wand.initial_rig import TwoViewGeometry, build_initial_rig
 from calib.wand.labels import label_recording
-from camera_node.detection.roundels import Roundels
 from camera_node.foundation.arrays import Array
 from camera_node.geometry.pose import Pose, invert, rotation_from_vector
 from camera_node.protocol.messages import Detections
 from camera_node.sources.recorded_detections import read_observations
 from tests.calib.cube import CORNERS, CUBE, SIGMA_PX, one_after_the_other, wave
-from tests.calib.synthetic import CAREFUL, assert_honest, camera_errors, ring, roughly
+from tests.calib.synthetic import CAREFUL, assert_honest, camera_errors, ring, roughly, see_points
 
 
 def only(messages: list[Detections], name: str, keep: Callable[[Detections], bool]) -> list[Detections]:
@@ -164,10 +163,7 @@ def test_ten_frames_of_many_numbered_points_place_the_cameras():
         points = transform(arena.wand_pose(1e-9 * t_ns), board.points)
         for name, camera in arena.truth.cameras.items():
             uv = camera.project_world(points) + SIGMA_PX * rng.standard_normal((240, 2))
-            seen = np.flatnonzero(camera.sees(uv))
-            roundels = Roundels.from_points(uv[seen], SIGMA_PX, seen.astype(np.int32))
-            header = {"camera": name, "width": camera.width, "height": camera.height}
-            messages.append(Detections.pack(roundels, seq=seq, t_ns=t_ns, **header))
+            messages.append(see_points(name, camera, uv, SIGMA_PX, seq=seq, t_ns=t_ns))
     result = calibrate(arena.intrinsics, board, messages, synchronous=True)
     assert len(result.rig.placed()) == 4
     assert camera_errors(result.rig, arena.truth)[0].max() < 0.01

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calib.rig.camera import DRIFT, LENS, OFFSET, PER_CAMERA, POSE, READOUT
+from calib.rig.camera import DRIFT, LENS, NEAREST_M, OFFSET, PER_CAMERA, POSE, READOUT
 from calib.rig.rig import Rig
 from calib.wand.bundle_adjustment.disc_centres import displacement
 from calib.wand.bundle_adjustment.problem import gauge_directions
 from calib.wand.bundle_adjustment.residuals import (
-    NEAREST_M,
     predict_markers,
     reprojection_errors,
     reprojection_jacobians,
