@@ -147,7 +147,8 @@ def _suggest(kind: type, fault: str) -> str:
     if given and given[1] in KINDS:
         return f"; {KINDS[given[1]]} have a file of their own: give its path there"
     match = re.fullmatch(r"Object contains unknown field `([^`]*)`(?: - at `\$(.*)`)?", fault)
-    known = _fields(msgspec.inspect.type_info(kind), (match[2] or "").split(".")[1:]) if match else []
+    path = re.sub(r"\[\d+\]", "", match[2] or "") if match else ""
+    known = _fields(msgspec.inspect.type_info(kind), path.split(".")[1:]) if match else []
     if not match or not known:
         return ""
     similar = most_similar(match[1], known)
@@ -155,11 +156,13 @@ def _suggest(kind: type, fault: str) -> str:
 
 
 def _fields(info: msgspec.inspect.Type, steps: list[str]) -> list[str]:
-    """Names of the fields of the struct at a path of field names inside a type."""
+    """Names of the fields of the struct at a path of field names inside a type; an entry of a list has no step."""
     if isinstance(info, msgspec.inspect.UnionType):
         return [name for kind in info.types for name in _fields(kind, steps)]
     if isinstance(info, msgspec.inspect.DictType):
         return _fields(info.value_type, steps[1:])
+    if isinstance(info, (msgspec.inspect.ListType, msgspec.inspect.VarTupleType)):
+        return _fields(info.item_type, steps)
     if not isinstance(info, msgspec.inspect.StructType):
         return []
     if not steps:

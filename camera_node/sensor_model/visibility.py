@@ -88,13 +88,21 @@ def lens_sees(lens: Lens, points: Array) -> Mask:
 
     A distortion polynomial projects points far beyond that angle into the image again.
     """
-    points = np.atleast_2d(points)
+    return within_reach(np.atleast_2d(points), reach(lens))
+
+
+def reach(lens: Lens) -> float:
+    """The tangent of the angle from the axis that the image's corners reach."""
     u, v = (np.linspace(-0.5, n - 0.5, 9) for n in (lens.width, lens.height))
     frame = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     xy = lens.normalise(frame)
-    reach = np.linalg.norm(xy[np.isfinite(xy).all(axis=1)], axis=1).max(initial=0.0)
-    radius = np.linalg.norm(points[:, :2], axis=1)
-    return (points[:, 2] > 0) & (radius <= 1.02 * reach * points[:, 2])
+    return float(np.linalg.norm(xy[np.isfinite(xy).all(axis=1)], axis=1).max(initial=0.0))
+
+
+def within_reach(points: Array, tangent: float | Array) -> Mask:
+    """(..., N) whether points (..., N, 3) lie within an angle from the axis, by its tangent, which is not exact."""
+    radius = np.linalg.norm(points[..., :2], axis=-1)
+    return (points[..., 2] > 0) & (radius <= 1.02 * tangent * points[..., 2])
 
 
 def is_detected(

@@ -48,7 +48,8 @@ FIRST_DAMPING = 1e-4
 BEHIND = 1e6  # squared residual of a disc that is behind its camera
 ADEQUATE = 1.5  # ratio of the mean robust cost to that of noise, up to which a model explains the residuals
 MIN_FOR_PAIRS = 3  # cameras, of which two that move together look like the third: more are needed for pairs
-MAX_SUSPECTS = 4  # cameras that are combined to pairs: those that explain most alone
+MAX_PAIRS = 6  # that are fitted: those that explain most by one linear system
+MAX_SUSPECTS = 4  # robots whose shapes are tried one by one: those whose markers seem farthest off
 SCALES = 2.0 ** np.arange(0, 12, 0.25)  # of the errors that the calibration states
 
 
@@ -384,13 +385,17 @@ def judge(window: Window, starts: Array, moved: Sequence[int] = ()) -> Verdict:
     scale = _most_likely_scale(window, everything)
     if not is_contradicted(none, in_common, everything.noise(window)):
         return Verdict(None, (), none, scale=scale)
-    if not everything.is_adequate():  # nor is any other hypothesis
-        return Verdict(None, tuple(range(n)), everything, none.misfit, scale)
+    if not everything.is_adequate():  # nor is any other hypothesis, and free errors may be of metres
+        return Verdict(None, tuple(range(n)), everything, none.misfit, _most_likely_scale(window, none))
     scaled = fit(window, replace(none.hypothesis, scale=scale))
-    return replace(_compare(window, [none, scaled], starts, moved), misfit=none.misfit, scale=scale)
+    return replace(
+        _compare(window, [none, scaled], everything, starts, moved), misfit=none.misfit, scale=scale
+    )
 
 
-def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Sequence[int]) -> Verdict:
+def _compare(
+    window: Window, as_stated: Sequence[Fit], everything: Fit, starts: Array, moved: Sequence[int]
+) -> Verdict:
     n, seeing = len(window.names), np.unique(window.camera).tolist()
     if moved:
         return decide([*as_stated, fit(window, Hypothesis.of("pose", moved, n, starts))], seeing, moved)
@@ -402,8 +407,8 @@ def _compare(window: Window, as_stated: Sequence[Fit], starts: Array, moved: Seq
     suspected = _displaced_most(window, all_shapes)
     fits += [all_shapes, *(fit(window, replace(all_shapes.hypothesis, robots=(r,))) for r in suspected)]
     if len(seeing) > MIN_FOR_PAIRS:
-        suspects = _suspects([f for f in fits if f.hypothesis.cause == "pose"])
-        fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in combinations(suspects, 2)]
+        likely = _likely_pairs(window, everything, seeing)
+        fits += [fit(window, Hypothesis.of("pose", pair, n, starts)) for pair in likely]
     return decide([*as_stated, *fits], seeing)
 
 
@@ -444,11 +449,43 @@ def _allowed(S: Array, A: Array) -> float:
 
 def explained(P: Array, H: Array, y: Array, G: Array, sigma: float) -> tuple[Array, Array]:
     """(K,) how much less keyframes cost if errors are free along one of the columns of G (8 C, K) alone, with a
-    standard deviation `sigma`, and (K,) the errors along it: a rank-one change of the covariance P (8 C, 8 C) of the
-    cameras' errors, of which the keyframes show H e = y."""
-    with_them = np.linalg.solve(np.eye(len(y)) + H @ P, np.column_stack([y, H @ G]))
-    score, information = G.T @ with_them[:, 0], np.einsum("ik,ik->k", G, with_them[:, 1:]) + sigma**-2
+    standard deviation `sigma`, and (K,) the errors along it; P (8 C, 8 C), H and y as of `_FreedErrors`."""
+    score, information = _FreedErrors(P, H, y).along(G)
+    information = np.diag(information) + sigma**-2
     return score**2 / information, score / information
+
+
+def most_explained(window: Window, none: Fit) -> float:
+    """By how much less a window costs, in units of what chance allows (`RIVAL`), if errors of one cause are free in one
+    camera, or in all that have it in common: the most of all of them, by one linear system at the start of a fit."""
+    freed, cameras = _FreedErrors(window.covariance(1.0), *none.equations), _columns(window)
+    free = [(cameras[:, k, of], FREE_SIGMA[of]) for k in range(len(window.names)) for of in CAUSES.values()]
+    free += [(window.common(of)[:, None], np.array([sigma])) for of, sigma in COMMON_SIGMA.items()]
+    return max(freed.gain(G, sigma) / float(chdtri(len(sigma), RIVAL)) for G, sigma in free)
+
+
+def _columns(window: Window) -> Array:
+    """(8 C, C, 8) the errors of the cameras, one column for each error of each camera."""
+    n = len(window.names)
+    return np.eye(ERRORS * n).reshape(-1, n, ERRORS)
+
+
+class _FreedErrors:
+    """What errors of the cameras explain of keyframes that show H e = y, beside those of the covariance P (8 C, 8 C)
+    that the calibration states: a change of it of low rank."""
+
+    def __init__(self, P: Array, H: Array, y: Array) -> None:
+        self._with_stated = np.linalg.solve(np.eye(len(y)) + H @ P, np.column_stack([y, H]))
+
+    def along(self, G: Array) -> tuple[Array, Array]:
+        """(K,) score and (K, K) information of errors along the columns of G (8 C, K)."""
+        return G.T @ self._with_stated[:, 0], G.T @ self._with_stated[:, 1:] @ G
+
+    def gain(self, G: Array, sigma: Array) -> float:
+        """By how much less the keyframes cost if errors along the columns of G (8 C, K) are free together, with these
+        standard deviations (K,)."""
+        score, information = self.along(G)
+        return float(score @ np.linalg.solve(information + np.diag(sigma**-2), score))
 
 
 def is_contradicted(none: Fit, in_common: Array, variance: float) -> bool:
@@ -535,9 +572,15 @@ def decide(fits: Sequence[Fit], seeing: Sequence[int], moved: Sequence[int] = ()
     return Verdict(None, tuple(seeing if best.hypothesis.odds else sorted(named)), best, size=size)
 
 
-def _suspects(poses: Sequence[Fit]) -> list[int]:
-    ranked = sorted(poses, key=lambda f: f.cost)[:MAX_SUSPECTS]
-    return sorted(f.hypothesis.cameras[0] for f in ranked)
+def _likely_pairs(window: Window, everything: Fit, seeing: Sequence[int]) -> list[tuple[int, int]]:
+    """The pairs of cameras that explain most if the poses of both are free, by the equations of a fit of all errors."""
+    freed = _FreedErrors(window.covariance(1.0), *everything.equations)
+    poses, sigma = _columns(window)[:, :, CAUSES["pose"]], np.tile(FREE_SIGMA[CAUSES["pose"]], 2)
+
+    def gain(pair: tuple[int, int]) -> float:
+        return freed.gain(np.hstack([poses[:, k] for k in pair]), sigma)
+
+    return sorted(combinations(seeing, 2), key=gain)[-MAX_PAIRS:]
 
 
 def fit(window: Window, hypothesis: Hypothesis, max_iterations: int = MAX_ITERATIONS) -> Fit:

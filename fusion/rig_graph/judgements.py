@@ -2,7 +2,7 @@
 """What the newest keyframes show of the cameras: judged in a process beside the one that tracks.
 
 `judge_latest`  which hypothesis explains the longest window in which nothing changed, and what it measures
-`watch`         whether another offset of a clock explains the newest keyframes: a tenth of the work
+`watch`         whether other errors of cameras explain the newest keyframes: a tenth of the work
 `confirm`       whether the one of three cameras that is blamed moved from one moment to the next
 """
 
@@ -34,6 +34,7 @@ from fusion.rig_graph.hypotheses import (
     fit,
     has_changed,
     judge,
+    most_explained,
     retract,
     several_markers,
 )
@@ -64,12 +65,27 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class OtherClock:
-    """By how much less keyframes cost if one clock has another offset; and these offsets, s, either way, by camera: of
-    the best and of all that explain as much but for chance, as both of two cameras do."""
+class Watched:
+    """What the newest keyframes show at the start of a fit.
+
+    Attributes:
+        gain: by how much less they cost with other errors of cameras, see `most_explained`.
+        clock_gain: by how much less with another offset of one clock.
+        offsets_s: these offsets, s, either way, by camera: of the best and of all that explain as much but for chance,
+            as both of two cameras do.
+    """
 
     gain: float
+    clock_gain: float
     offsets_s: dict[int, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Unexplained:
+    """Cameras contradict each other, and no hypothesis leaves nothing but noise: `scale` is by how much the errors of
+    all of them would be larger than stated."""
+
+    scale: float
 
 
 Judgement = tuple[Window, Verdict, Measured | None]
@@ -82,9 +98,10 @@ def judge_latest(
     shapes: RobotShapes,
     since_ns: int,
     moved: Sequence[str],
-) -> Judgement | None:
-    """Judge the longest window in which nothing changed; None without one. What its keyframes after a time show of the
-    errors of cameras and the shapes of robots is measured."""
+) -> Judgement | Unexplained | None:
+    """Judge the longest window in which nothing changed; without one, what the newest keyframes contradict. What its
+    keyframes after a time show of the errors of cameras and the shapes of robots is measured."""
+    unexplained = None
     for n in WINDOWS:
         if n <= len(keyframes):
             window, starts = window_of(keyframes[-n:], cameras, markers)
@@ -95,19 +112,22 @@ def judge_latest(
             is_constant = newest.all() or not has_changed(window, verdict.fit, newest)
             if is_constant and verdict.fit.is_adequate() and _is_stationary(verdict.fit.by_keyframe(window)):
                 return window, verdict, _measure(window, verdict, keyframes[-n:], shapes, since_ns)
-    return None
+            is_unexplained = len(verdict.cameras) > 0 and not verdict.fit.is_adequate()
+            unexplained = Unexplained(verdict.scale) if is_unexplained else None
+    return unexplained
 
 
-def watch(keyframes: Sequence[Keyframe], cameras: CameraArray, markers: MarkerTable) -> OtherClock:
-    """The clocks of which another offset explains keyframes best: velocities of robots explain it to a frame set, and a
-    judgement takes ten times as long."""
+def watch(keyframes: Sequence[Keyframe], cameras: CameraArray, markers: MarkerTable) -> Watched:
+    """Whether other errors of cameras explain keyframes: robots explain them to a frame set, and a judgement takes ten
+    times as long."""
     window, _ = window_of(keyframes, cameras, markers, may_have_moved=False)
     if not len(window.camera):
-        return OtherClock(0.0, {})
+        return Watched(0.0, 0.0, {})
     none = fit(window, Hypothesis.of(None, (), len(window.names)), max_iterations=0)
     gains, offsets = other_offsets(window.covariance(1.0), *none.equations)
     likely = np.flatnonzero(gains > gains.max() - chdtri(1, RIVAL))
-    return OtherClock(float(gains.max()), {int(k): abs(float(offsets[k])) for k in likely})
+    of_clocks = float(gains.max()), {int(k): abs(float(offsets[k])) for k in likely}
+    return Watched(most_explained(window, none), *of_clocks)
 
 
 def blames_one_of_three(window: Window, verdict: Verdict) -> bool:

@@ -3,7 +3,7 @@
 
     frame sets            -> `Keyframes`: with the robots around them
     every second or so    -> `judge`: which hypothesis about the cameras explains the keyframes?
-    twice a second        -> `watch`: has a clock changed? then they are judged at once
+    twice a second        -> `watch`: do errors of cameras explain more than before? then they are judged at once
     a pose, decided       -> the camera is excluded until its pose is known, then used with it
     undecided             -> the cameras that contradict each other are reported, and all are used as they are
 
@@ -38,7 +38,6 @@ from fusion.rig_graph.hypotheses import (
     FALSE_ALARM,
     LARGE,
     MIN_FOR_PAIRS,
-    RIVAL,
     Fit,
     Hypothesis,
     Verdict,
@@ -50,7 +49,8 @@ from fusion.rig_graph.judgements import (
     WINDOWS,
     Judgement,
     Measured,
-    OtherClock,
+    Unexplained,
+    Watched,
     blames_one_of_three,
     confirm,
     judge_latest,
@@ -65,10 +65,10 @@ from fusion.rig_graph.robot_shapes import RobotShapes
 log = logging.getLogger("fusion")
 CHECK_NS = 500_000_000  # between two checks
 SUSPICIOUS_NS = 200_000_000  # the same, while cameras contradict each other
-# Of the time, while nothing changes: judgements, and comparisons of the clocks between them. Both are measured in whole
+# Of the time, while nothing changes: judgements, and `watch` between them. Both are measured in whole
 # frame sets, so that they take less of a core: together 8 to 11 %, of 4 and of 8 cameras.
 USUAL_SHARE, WATCH_SHARE = 0.06, 0.2
-GREW = 1.5  # ratio of what another offset of a clock explains, now and at the last judgement, to judge again
+GREW = 1.5  # ratio of what other errors explain, now and at the last judgement, to judge again
 MAX_SIGMA_PX = 0.3  # of an accepted pose, at the markers that show it
 MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be far off either
 # Of that factor in a window that contradicts nothing: it shows a part of the arena; one in which all cameras take part
@@ -98,7 +98,7 @@ class RigMonitor:
     def __init__(self, cameras: CameraArray, markers: MarkerTable) -> None:
         self._cameras, self._markers = cameras, markers
         self._keyframes = Keyframes(cameras, markers, max(WINDOWS))
-        self._job: Future[Judgement | OtherClock | None] | None = None
+        self._job: Future[Judgement | Unexplained | Watched | None] | None = None
         self._judged = 0  # jobs that were taken since they were asked for
         self._checked_ns = self._revision = self._n_undecided = 0
         self._pause_ns = self._watched_ns = self._watch_pause_ns = 0
@@ -121,6 +121,7 @@ class RigMonitor:
         self._scale = 1.0  # of the rig's errors, accepted
         self._claimed = 1.0  # the same, larger while nothing is decided
         self._doubted: set[str] = set()  # cameras that contradicted each other when claims grew
+        self._held = False  # whether robots agreed with the rig in a window since the start
         self.is_settled, self.refines = False, True
         self.executor: Executor | None = None
         self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
@@ -134,7 +135,7 @@ class RigMonitor:
         self.inherit_poses(old)
         self._shapes.inherit(old._shapes, same)
         self.excluded, self.executor, self._walk = old.excluded, old.executor, old._walk
-        self._moved = old._moved
+        self._moved, self._held = old._moved, old._held
         self._scale, self._claimed, self._doubted = old._scale, old._claimed, old._doubted
         self._refinement = old._refinement
         self._cameras.count_errors(old._cameras.error_scale, old._cameras.size_error)
@@ -222,8 +223,8 @@ class RigMonitor:
             now: the robots after the update with this frame set.
             fit: of the robots to the frame set. When it begins to be doubtful, something changed: the keyframes before
                 do not show what is now. Later, single frame sets may be, while robots follow the change in turns. If
-                one camera alone is displaced several times, it moved: the others show the robots where they are
-                predicted.
+                one camera alone is displaced several times, it moved, once the rig has held: the others show the
+                robots where they are predicted.
             recalibrates: False for the server of a zone that takes the rig from another.
         """
         self.is_settled = False
@@ -254,12 +255,14 @@ class RigMonitor:
             ):  # of a process that ended, or of a singular system: the next keyframes are others
                 log.exception("the cameras can't be judged")
                 return ()
-            if isinstance(judged, OtherClock):
+            if isinstance(judged, Watched):
                 self._watch_pause_ns = round((now_ns - self._watched_ns) / WATCH_SHARE)
-                self._note_other_clock(judged)
+                self._note_watched(judged)
                 return ()
             self._pause_ns = round((now_ns - self._checked_ns) / USUAL_SHARE)
-            if judged is None:
+            if isinstance(judged, Unexplained):
+                self._note_unexplained(judged)
+            elif judged is None:
                 self._is_contradicted = True
             elif self._is_confirmed or self._moved or not blames_one_of_three(*judged[:2]):
                 return self._act(*judged, recalibrates)
@@ -269,7 +272,7 @@ class RigMonitor:
         return ()
 
     def _judge(self, now_ns: int) -> None:
-        """Judge the newest keyframes, or only watch the clocks, if it is time."""
+        """Judge the newest keyframes, or only watch them, if it is time."""
         kept = tuple(self._keyframes.kept)
         if self._job is not None or len(kept) < min(WINDOWS):
             return
@@ -297,13 +300,15 @@ class RigMonitor:
             or bool(self._walk.departed)
             or self._walk.is_suspicious
             or self._cameras.error_scale > self._scale  # claims grew, and nothing explains why
-            or self._gain > max(float(chdtri(1, RIVAL)), GREW * self._judged_gain)
+            or self._gain > max(1.0, GREW * self._judged_gain)
         )
         return CHECK_NS if is_urgent else max(CHECK_NS, self._pause_ns)
 
     def _exclude_displaced(self, displaced: Mapping[int, int]) -> ExtrinsicsCorrection | None:
-        """While cameras contradict each other, robots may be predicted by the one that moved."""
-        if len(displaced) != 1 or len(self.contradicting) > 1:
+        """While cameras contradict each other, or did so from the start, robots may be predicted by the one that
+        moved. Judgements find it then, but not of three cameras, where the two that agree predict most robots."""
+        is_judged = not self._held and len(self._cameras.names) > MIN_FOR_PAIRS
+        if len(displaced) != 1 or len(self.contradicting) > 1 or is_judged:
             return None
         ((k, n_sets),) = displaced.items()
         name = self._cameras.names[k]
@@ -314,7 +319,7 @@ class RigMonitor:
         self._forget()
         return ExtrinsicsCorrection(name, None)
 
-    def _start(self, job: Callable[[], Judgement | OtherClock | None]) -> None:
+    def _start(self, job: Callable[[], Judgement | Unexplained | Watched | None]) -> None:
         self._job = done(job) if self.executor is None else self.executor.submit(job)
 
     def _act(
@@ -333,6 +338,7 @@ class RigMonitor:
         if self._n_undecided == 1 and not self._was_doubtful:
             self._keyframes.clear()
         self._is_contradicted = bool(names) or self._n_undecided == 1
+        self._held |= not self._is_contradicted
         if not is_known:
             self._scale_claims(window, verdict, names)
         if names:
@@ -403,6 +409,13 @@ class RigMonitor:
         size_error = abs(verdict.size) or self._cameras.size_error * fall
         self._cameras.count_errors(max(self._claimed, may_be), size_error)
 
+    def _note_unexplained(self, found: Unexplained) -> None:
+        """Let claims count errors as large as the newest keyframes show them."""
+        self._is_contradicted = True
+        self._doubted.update(self._cameras.names)
+        self._claimed = max(self._scale, self._scale * found.scale, AGREED_FALL * self._claimed)
+        self._cameras.count_errors(self._claimed, self._cameras.size_error)
+
     def _states_errors(self) -> bool:
         return any(c.errors or c.covariance for c in self._cameras.as_dict().values())
 
@@ -419,10 +432,11 @@ class RigMonitor:
             self._use(name)
         return tuple(ExtrinsicsCorrection(name, self._cameras[name], has_returned=True) for name in names)
 
-    def _note_other_clock(self, other: OtherClock) -> None:
-        self._gain, self._judged_gain = other.gain, min(other.gain, self._judged_gain)
-        if other.gain > chdtri(1, FALSE_ALARM):
-            self.clock_doubts |= {self._cameras.names[k]: offset_s for k, offset_s in other.offsets_s.items()}
+    def _note_watched(self, watched: Watched) -> None:
+        self._gain, self._judged_gain = watched.gain, min(watched.gain, self._judged_gain)
+        if watched.clock_gain > chdtri(1, FALSE_ALARM):
+            offsets_s = watched.offsets_s.items()
+            self.clock_doubts |= {self._cameras.names[k]: offset_s for k, offset_s in offsets_s}
 
     def _note_clocks(self, verdict: Verdict, measured: Measured | None) -> None:
         """Add a window that contradicts no pose and no lens to what is known of the clocks.

@@ -28,6 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
 from camera_node.foundation.arrays import Array, Index, Mask
 from fusion.model.observations import Assignments, MatchedObservations
@@ -48,6 +49,7 @@ STRONG_DETECTIONS = 8  # of three markers: they overdetermine a pose by ten
 # Shares of the expected views that are detected. A true fit has 1 where nothing covers the robot, one with a wrong
 # marker up to 0.67, and a false one up to 0.5.
 MIN_EXPLAINED, EVIDENT = 0.6, 0.8
+POSE, CHANCE = 6, 1e-3  # parameters of a pose, and the probability of a chi-square that is not chance
 MAX_COMPARED = 1_000  # mappings in one frame set, all rivals of some robots; more wait for their turn
 MAX_RIVALS = (
     3_000  # mappings that compete with those of one robot; with more it waits until others are acquired
@@ -245,7 +247,8 @@ class _Decisions:
         return _ComparedFits(fits, refined, *_best_rivals(fits.mappings, refined.chi2))
 
     def _is_evident(self, level: _ComparedFits) -> Mask:
-        """(K,) fits with more than three markers, or with all three of a robot and enough detections in common frames.
+        """(K,) fits with more than three markers, or with all three of a robot and enough detections in common frames,
+        whose chi-square is chance.
 
         Of a robot with several sides, those whose expected views are detected.
         """
@@ -255,7 +258,8 @@ class _Decisions:
         is_whole &= level.refined.shared >= MIN_EXPLAINED
         explained = level.refined.explained
         many = is_whole | (mappings.points.shape[1] > MIN_MARKERS)
-        return np.where(np.isnan(explained), many, explained >= EVIDENT)
+        is_chance = level.refined.chi2 < chdtri(2 * n_detections - POSE, CHANCE)
+        return is_chance & np.where(np.isnan(explained), many, explained >= EVIDENT)
 
     def _has_all(self, mappings: Mappings) -> Mask:
         """(K,) mappings of all markers of a robot."""

@@ -30,10 +30,11 @@ class ZonedHall:
 
     Attributes:
         gap_ms: the longest time between two poses of a robot.
-        doubles: poses of another zone within half a period.
+        doubles: poses between two of another zone that are a period apart; zones take turns at a handover, with frame
+            sets at other times of the period.
         handovers: of all robots.
-        wrong: poses that are far from the truth.
-        error_mm: RMS of the others.
+        wrong: tracked poses that are far from the truth.
+        error_mm: RMS of the other tracked poses.
         cost_ms: processor time of a frame set, mean of the zones.
     """
 
@@ -59,17 +60,25 @@ def run(load: Hall, zones: int, seconds: float) -> ZonedHall:
         [entry for entry in stream if entry[1].t_ns > START_NS + START_S * 1e9]
         for stream in hall.streams().values()
     ]
-    half_ns = 0.5e9 / load.hz
-    steps = [(a, b, b[1].t_ns - a[1].t_ns) for stream in streams for a, b in pairwise(stream)]
-    errors_m = np.array([_error_m(load, pose) for stream in streams for _, pose in stream])
+    steps_ns = [b[1].t_ns - a[1].t_ns for stream in streams for a, b in pairwise(stream)]
+    tracked = [pose for stream in streams for _, pose in stream if pose.state == "tracked"]
+    errors_m = np.array([_error_m(load, pose) for pose in tracked])
     is_wrong = errors_m > WRONG_M
     return ZonedHall(
-        max(step for _, _, step in steps) * 1e-6,
-        sum(a[0] != b[0] and step < half_ns for a, b, step in steps),
+        max(steps_ns) * 1e-6,
+        sum(_count_doubles(stream, 1.5e9 / load.hz) for stream in streams),
         sum(map(changes, streams)),
         int(is_wrong.sum()),
         1e3 * float(np.sqrt(np.mean(errors_m[~is_wrong] ** 2))),
         cost_ms,
+    )
+
+
+def _count_doubles(stream: list[tuple[str, RobotPose]], within_ns: float) -> int:
+    """How many poses of a robot stand between two of another zone that are so close to each other."""
+    return sum(
+        a[0] == c[0] != b[0] and c[1].t_ns - a[1].t_ns < within_ns
+        for a, b, c in zip(stream, stream[1:], stream[2:], strict=False)
     )
 
 

@@ -8,7 +8,7 @@ from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.frames import CalibratedFrame
 from tests.fusion.synthetic import TRIANGLE, WIDE, Arena, line
 
-MOVE_S = 0.7
+MOVE_S = 1.0  # after the robots agreed with the rig
 ROBOTS = {"a": TRIANGLE, "b": WIDE}
 MOTIONS = {
     "a": line((-0.5, 0.3, 0.15), (0.25, -0.1, 0), turn=(0, 0, 0.5)),

@@ -520,7 +520,7 @@ bool PhotometricFitter::condition_on_print(const Print& print) {
     const Parameters with = covariance_with_ratio(), bent = effect_of_curvature(tone_.sigma);
     const double seen = print.ratio + effect_of_curvature(tone_.expected)[kRatio];
     const double off = seen - p_[kRatio];
-    const double variance = with[kRatio] + square(bent[kRatio]) + square(print.sigma);
+    const double variance = with[kRatio] + square(bent[kRatio]) + square(print.sigma) + print.spread;
     if (square(off) > square(kContradiction) * variance) return false;
     for (int i = 0; i < kPoseCount; ++i) {
         const double both = with[kX + i] + bent[kX + i] * bent[kRatio];

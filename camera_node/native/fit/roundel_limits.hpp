@@ -16,6 +16,7 @@ struct Print {
 
     double ratio, sigma = kPaper;
     bool assumed = false;
+    double spread = 0;  // variance of the ratios of this kind's prints, beyond that of sigma
     bool is_exact() const { return !assumed && sigma <= kPaper; }
 };
 

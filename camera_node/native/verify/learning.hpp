@@ -58,16 +58,25 @@ struct Regression {
     };
     std::array<Row, N> information{};  // lower triangle
     Row right{};
+    double squares = 0;  // weighted, of the values
     void include(const Row& by, double value, double weight) {
         for (size_t i = 0; i < N; ++i) {
             for (size_t j = 0; j <= i; ++j) information[i][j] += weight * by[i] * by[j];
             right[i] += weight * by[i] * value;
         }
+        squares += weight * value * value;
     }
     void forget(double share) {
         for (Row& row : information)
             for (double& value : row) value *= 1 - share;
         for (double& value : right) value *= 1 - share;
+        squares *= 1 - share;
+    }
+    /// The weighted squares that an estimate with priors of mean 0 leaves, of the values and the priors.
+    double rest(const Row& mean) const {
+        double rest = squares;
+        for (size_t i = 0; i < N; ++i) rest -= right[i] * mean[i];
+        return rest;
     }
     /// The estimate with priors of this information and mean on the unknowns; none where it is not
     /// determined.

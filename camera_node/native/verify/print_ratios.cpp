@@ -37,8 +37,15 @@ Regression<2>::Estimate PrintRatios::Kind::estimate() const {
 }
 
 double PrintRatios::Kind::curvature_with(double print_ratio) const {
-    const auto& [information, right] = regression;
+    const auto& [information, right, squares] = regression;
     return (right[1] - information[1][0] * print_ratio) / (information[1][1] + 1 / square(kCurvaturePrior));
+}
+
+/// By moments (DerSimonian and Laird): what n measurements and the prior leave, n - 1 expected, beyond their
+/// variance, of which `kModelSigma` is a part.
+double PrintRatios::Kind::spread(const Regression<2>::Estimate& estimate) const {
+    const double excess = regression.rest(estimate.mean) - (count - 1);
+    return std::max(0.0, square(kModelSigma) + excess / regression.information[0][0]);
 }
 
 void PrintRatios::Kind::include(double ratio, double by_curvature, double sigma) {
@@ -89,17 +96,18 @@ bool PrintRatios::is_new(int track, double by_curvature) {
 
 /// Chooses the print of a kind that recurs: a usual one unless the regression contradicts it.
 void PrintRatios::assign(Kind& kind) {
-    const auto [mean, cov] = kind.estimate();
-    const double measured = mean[0], sigma = std::max(Print::kPaper, std::sqrt(cov[0][0]));
+    const auto estimate = kind.estimate();
+    const double measured = estimate.mean[0], sigma = std::max(Print::kPaper, std::sqrt(estimate.cov[0][0]));
     if (kind.assigned && sigma > kExact) return;
     const Print& usual = nearest_print(kUsual, measured);
     const double curvature = kind.curvature_with(usual.ratio);
     const double both = std::hypot(sigma, kDotGain), off = usual.ratio - measured;
     const bool contradicts =
         std::abs(off) > kContradiction * both || curvature < kMinCurvature || curvature > kMaxCurvature;
-    const Print print = contradicts ? Print{measured, sigma}
-                                    : Print{measured + off * square(sigma / both),
-                                            std::max(Print::kPaper, sigma * kDotGain / both)};
+    Print print = contradicts ? Print{measured, sigma}
+                              : Print{measured + off * square(sigma / both),
+                                      std::max(Print::kPaper, sigma * kDotGain / both)};
+    print.spread = kind.spread(estimate);
     if (!kind.assigned || std::abs(print.ratio - kind.assigned->ratio) > print.sigma ||
         print.sigma < kSharper * kind.assigned->sigma)
         kind.assigned = print;

@@ -49,6 +49,8 @@ class PrintRatios {
         void include(double ratio, double by_curvature, double sigma);
         Regression<2>::Estimate estimate() const;         // after a measurement
         double curvature_with(double print_ratio) const;  // if that is the print
+        /// The variance of the prints' own ratios around that of the kind.
+        double spread(const Regression<2>::Estimate& estimate) const;
     };
     Kind& kind_of(double ratio, double by_curvature);
     bool is_new(int track, double by_curvature);

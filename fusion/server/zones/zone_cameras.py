@@ -14,7 +14,7 @@ from calib.rig.camera import Camera
 from camera_node.foundation.arrays import Array, Mask
 from camera_node.sensor_model.operational_space import farthest_distance
 from camera_node.sensor_model.threshold import MIN_DIAMETER_PX
-from camera_node.sensor_model.visibility import lens_sees
+from camera_node.sensor_model.visibility import reach, within_reach
 
 SAMPLES = 9  # of a camera's view along each side and in depth: an overlap of an eighth of it is found
 
@@ -60,22 +60,26 @@ class ZoneCameras:
         """A zone's own cameras, and those of others that see places that its own ones see."""
         return set(own) | {camera for camera in self._views if self._overlap(camera, own)}
 
-    def sees(self, cameras: Collection[str], points: Array) -> Mask:
-        """(N,) points (N, 3) that one of the cameras sees."""
-        seen = [view.sees(points) for name, view in self._views.items() if name in cameras]
-        return np.any(seen, axis=0) if seen else np.zeros(len(points), bool)
+    def look_at(self, points: Array) -> "SeenPlaces":
+        """How all cameras see places (N, 3), world."""
+        information = {}
+        for name in self._near(points):
+            of_camera = self._views[name].information(points)
+            if of_camera.any():
+                information[name] = of_camera
+        return SeenPlaces(len(points), information)
 
-    def variances(self, cameras: Collection[str], points: Array) -> Array:
-        """(N,) expected variances of positions (N, 3) by the centre and the size of one roundel's image in the cameras
-        that see it, m^2 for an error of 1 px; infinite where none does."""
-        information = np.zeros((len(points), 3, 3))
-        for name, view in self._views.items():
-            if name in cameras:
-                information += view.information(points)
-        seen = information.any(axis=(1, 2))
-        variances = np.full(len(points), np.inf)
-        variances[seen] = np.trace(np.linalg.inv(information[seen]), axis1=1, axis2=2)
-        return variances
+    def _near(self, points: Array) -> list[str]:
+        """The cameras within whose range and angle some of the points (N, 3) are."""
+        views = list(self._views.values())
+        if not views:
+            return []
+        local = (points - np.array([view.centre for view in views])[:, None]) @ np.array(
+            [v.R.T for v in views]
+        )
+        tangent, range_m = np.array([(view.tangent, view.range_m) for view in views]).T[:, :, None]
+        near = (within_reach(local, tangent) & (local[:, :, 2] < range_m)).any(axis=1)
+        return [name for name, is_near in zip(self._views, near, strict=True) if is_near]
 
     def _overlap(self, camera: str, others: Collection[str]) -> int:
         """How many sampled points a camera shares with others."""
@@ -98,6 +102,37 @@ class ZoneCameras:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SeenPlaces:
+    """How cameras see N places.
+
+    Attributes:
+        n: N.
+        information: of the cameras that see some of them (N, 3, 3) by the centre and the size of a roundel's image,
+            m^-2 for an error of 1 px; zero for places that the camera does not see.
+    """
+
+    n: int
+    information: dict[str, Array]
+
+    def by(self, cameras: Collection[str]) -> Mask:
+        """(N,) the places that one of the cameras sees."""
+        return np.trace(self._sum(cameras), axis1=1, axis2=2) > 0
+
+    def variances(self, cameras: Collection[str]) -> Array:
+        """(N,) expected variances of positions by the cameras that see them, m^2 for an error of 1 px; infinite where
+        none does."""
+        information, seen = self._sum(cameras), self.by(cameras)
+        variances = np.full(self.n, np.inf)
+        variances[seen] = np.trace(np.linalg.inv(information[seen]), axis1=1, axis2=2)
+        return variances
+
+    def _sum(self, cameras: Collection[str]) -> Array:
+        """(N, 3, 3) of these cameras together."""
+        of_these = [of_camera for name, of_camera in self.information.items() if name in cameras]
+        return sum(of_these, np.zeros((self.n, 3, 3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _View:
     """What a placed camera sees.
 
@@ -106,6 +141,7 @@ class _View:
         R, centre: from the world into the camera, and its place in the world.
         diameter_m: of a roundel.
         range_m: along the optical axis, at which that is too small for the detector.
+        tangent: of the angle from the axis that the image's corners reach.
     """
 
     camera: Camera
@@ -113,12 +149,13 @@ class _View:
     centre: Array
     diameter_m: float
     range_m: float
+    tangent: float
 
     @classmethod
     def of(cls, camera: Camera, diameter_m: float) -> "_View":
         T = camera.matrix()
         range_m = farthest_distance(camera, diameter_m, MIN_DIAMETER_PX)
-        return cls(camera, T[:3, :3].T, T[:3, 3], diameter_m, range_m)
+        return cls(camera, T[:3, :3].T, T[:3, 3], diameter_m, range_m, reach(camera))
 
     def is_near(self, other: "_View") -> bool:
         """Whether the spheres within their ranges intersect."""
@@ -127,8 +164,7 @@ class _View:
     def sees(self, points: Array) -> Mask:
         """(N,) of points (N, 3), world."""
         local = (points - self.centre) @ self.R.T
-        seen = (local[:, 2] > 0) & (local[:, 2] < self.range_m)
-        seen[seen] = lens_sees(self.camera, local[seen])
+        seen = within_reach(local, self.tangent) & (local[:, 2] < self.range_m)
         seen[seen] = self.camera.sees(self.camera.project(local[seen]))
         return seen
 

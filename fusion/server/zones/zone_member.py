@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 
 from calib.rig.camera import Camera
-from camera_node.foundation.arrays import Array, Index
+from camera_node.foundation.arrays import Index
 from fusion.model.robots import Robot
 from fusion.protocol.zone_messages import ZoneStates, zone_key
 from fusion.server.arena_config import Zone
 from fusion.server.zones.ownership import Ownership
-from fusion.server.zones.zone_cameras import ZoneCameras
+from fusion.server.zones.zone_cameras import SeenPlaces, ZoneCameras
 from fusion.tracking.track_table import TrackTable
 
 EXCHANGE_NS = (
@@ -91,11 +91,13 @@ class ZoneMember:
         """Claim and hand over robots after a frame set."""
         tracked = [table.names[k] for k in np.flatnonzero(table.tracked).tolist()]
         lost = [table.names[k] for k in np.flatnonzero(~table.alive).tolist()]
-        is_due = t_ns - self._weighed_ns >= EXCHANGE_NS
-        better = self._find_better(table) if is_due else {}
-        self._has_news |= self.ownership.step(t_ns, tracked, lost, better)
+        is_due, better = t_ns - self._weighed_ns >= EXCHANGE_NS, {}
         if is_due:
-            self._weighed_ns, self._states = t_ns, list(self._border_states(table, t_ns))
+            own = np.flatnonzero(table.owned & table.alive)
+            seen = self._cameras.look_at(table.states.p[own])
+            better = self._find_better(table, own, seen)
+            self._weighed_ns, self._states = t_ns, list(self._border_states(table, own, seen, t_ns))
+        self._has_news |= self.ownership.step(t_ns, tracked, lost, better)
 
     def messages(self, now_ns: int) -> Iterator[tuple[str, msgspec.Struct]]:
         """What is to be published now, and its keys."""
@@ -115,28 +117,26 @@ class ZoneMember:
         self._used = {zone: self._cameras.used(own) for zone, own in self._own.items()}
         self.own_cameras, self.used_cameras = self._own[self.name], self._used.pop(self.name)
 
-    def _find_better(self, table: TrackTable) -> dict[str, str]:
+    def _find_better(self, table: TrackTable, own: Index, seen: SeenPlaces) -> dict[str, str]:
         """The follower whose own cameras determine a robot best, of own robots of which that is not this zone."""
-        rows = np.flatnonzero(table.owned & table.alive)
-        followers = [self.ownership.followers(table.names[k]) for k in rows.tolist()]
-        near = np.array([len(zones) > 0 for zones in followers], bool)
-        rows, followers = rows[near], [zones for zones in followers if zones]
-        limit = np.where(table.tracked[rows], self._variances(self.name, table, rows) / HYSTERESIS, np.inf)
+        followers = [self.ownership.followers(table.names[k]) for k in own.tolist()]
+        limit = np.where(
+            table.tracked[own], seen.variances(self._own.get(self.name, ())) / HYSTERESIS, np.inf
+        )
         better: dict[str, str] = {}
         for zone in sorted({zone for zones in followers for zone in zones}):
-            variance = self._variances(zone, table, rows)
-            for i, k in enumerate(rows.tolist()):
+            variance = seen.variances(self._own.get(zone, ()))
+            for i, k in enumerate(own.tolist()):
                 if zone in followers[i] and variance[i] < limit[i]:
                     better[table.names[k]], limit[i] = zone, variance[i]
         return better
 
-    def _variances(self, zone: str, table: TrackTable, rows: Index) -> Array:
-        return self._cameras.variances(self._own.get(zone, ()), table.states.p[rows])
-
-    def _border_states(self, table: TrackTable, t_ns: int) -> Iterator[tuple[str, ZoneStates]]:
+    def _border_states(
+        self, table: TrackTable, own: Index, seen: SeenPlaces, t_ns: int
+    ) -> Iterator[tuple[str, ZoneStates]]:
         """For each other zone the states of the own robots that its cameras may see."""
-        rows = np.flatnonzero(table.owned & table.tracked)
+        tracked = table.tracked[own]
         for zone, cameras in self._used.items():
-            seen = rows[self._cameras.sees(cameras, table.states.p[rows])]
-            if len(seen):
-                yield zone, ZoneStates.of(t_ns, table.names, table.states, seen)
+            rows = own[tracked & seen.by(cameras)]
+            if len(rows):
+                yield zone, ZoneStates.of(t_ns, table.names, table.states, rows)

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import msgspec
 
+from calib.rig.camera import Camera
 from calib.rig.rig import Rig, save_rig
 from camera_node.protocol.messages import CameraStatus, Keys, MessageError, decode
 from fusion.client.arena import Arena as Client
-from fusion.model.robots import save_robots
+from fusion.model.robots import Robot, save_robots
 from fusion.protocol.pose_messages import FusionStatus
+from tests.benchmarks.faults.camera import displaced
 from tests.benchmarks.faults.judge import PoseJudge
 from tests.benchmarks.faults.network import Loopback
 from tests.benchmarks.faults.programs import Programs, python
@@ -46,20 +48,31 @@ class LiveArena:
         load: robots and cameras.
         extra: programs besides server and cameras: viewer, page, recorder, listener, bridge, rendered.
         network: where the programs run.
+        rig: the server's calibration, if it is not the true one.
+        robots: the server's robots, if they are not the true ones.
+        judge: the class that judges poses.
 
     Attributes:
-        rig: the cameras that the server knows; more may be added before entry.
+        rig: the cameras that the server's file has; more may be added before entry.
     """
 
     def __init__(
-        self, folder: Path, load: Load, extra: Sequence[str] = (), network: Loopback | None = None
+        self,
+        folder: Path,
+        load: Load,
+        extra: Sequence[str] = (),
+        network: Loopback | None = None,
+        rig: Rig | None = None,
+        robots: dict[str, Robot] | None = None,
+        judge: type[PoseJudge] = PoseJudge,
     ) -> None:
         self.folder, self.load, self.extra = folder, load, extra
         self.network = network or Loopback()
-        self.rig = dict(load.rig)
+        self.rig = dict(load.rig if rig is None else rig.cameras)
+        self._robots = load.bodies if robots is None else robots
         self.clock = Clock()
         self.world = World(load, self.clock.now_ns())
-        self.judge = PoseJudge(self.world)
+        self.judge = judge(self.world)
         self.keys = Keys(ARENA)
         self.cameras = tuple(load.rig)
         self.endpoint = f"tcp/{self.network.host}:{free_port()}"
@@ -117,6 +130,28 @@ class LiveArena:
                 raise TimeoutError(f"{self.judge.tracked(0.5)} of {len(self.world.names)} robots are tracked")
             self.wait(0.01)
         return time.monotonic() - begun_s
+
+    def wait_until_running(self) -> None:
+        """Wait until the server reports itself and all cameras.
+
+        Raises:
+            TimeoutError: it does not.
+        """
+        begun_s = time.monotonic()
+        while self.status is None or set(self.status.cameras) < set(self.cameras):
+            if time.monotonic() - begun_s > START_S:
+                raise TimeoutError("the server does not report all cameras")
+            self.wait(0.01)
+
+    def used_cameras(self) -> dict[str, Camera]:
+        """The cameras as the server uses them."""
+        rig = self.client.rig()
+        assert rig is not None  # the arena has one
+        return rig.cameras
+
+    def true_camera(self, name: str) -> Camera:
+        """A camera as it is by its faults."""
+        return displaced(self.load.rig[name], self.camera_faults[name])
 
     def start(self, name: str) -> None:
         """Start a program, also again after its end."""
@@ -199,7 +234,7 @@ class LiveArena:
     def _write_files(self) -> None:
         folder = self.folder
         save_rig(Rig(cameras=self.rig), folder / "rig.yaml")
-        save_robots(self.load.bodies, folder / "robots.yaml")
+        save_robots(self._robots, folder / "robots.yaml")
         files = {"rig": "rig.yaml", "saved_rig": "saved_rig.yaml", "robots": "robots.yaml"}
         files |= {"saved_robots": "saved_robots.yaml"}
         write(folder / "arena.yaml", {"arena": ARENA, "listen": [self.endpoint], **files})

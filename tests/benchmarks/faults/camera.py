@@ -129,11 +129,7 @@ class SceneCamera(Source):
 
     def place(self, fault: CameraFault) -> None:
         """Set the faults, and the true pose and focal length of the camera."""
-        T, camera = np.eye(4), self._world.load.rig[self._name]
-        T[:3, :3], T[:3, 3] = rotation_from_vector(np.array(fault.turn_rad)), fault.shift_m
-        moved, scale = Pose.from_matrix(camera.matrix() @ T), fault.focal_scale
-        true = msgspec.structs.replace(camera, T_world_cam=moved, fx=camera.fx * scale, fy=camera.fy * scale)
-        self._scene.cameras.place({self._name: true})
+        self._scene.cameras.place({self._name: displaced(self._world.load.rig[self._name], fault)})
         self.fault = fault
 
     @property
@@ -170,6 +166,14 @@ class SceneCamera(Source):
 
     def _wait_until(self, t_ns: int) -> bool:
         return not self._closed.wait(max(0, t_ns - time.time_ns()) * 1e-9)
+
+
+def displaced(camera: Camera, fault: CameraFault) -> Camera:
+    """A calibrated camera with its true pose and focal length."""
+    T, scale = np.eye(4), fault.focal_scale
+    T[:3, :3], T[:3, 3] = rotation_from_vector(np.array(fault.turn_rad)), fault.shift_m
+    moved = Pose.from_matrix(camera.matrix() @ T)
+    return msgspec.structs.replace(camera, T_world_cam=moved, fx=camera.fx * scale, fy=camera.fy * scale)
 
 
 def joined(a: Roundels, b: Roundels) -> Roundels:

@@ -150,6 +150,10 @@ class VirtualArena:
         """How long the next message of a camera takes; messages of one camera stay in their order."""
         return rng.exponential(TRANSIT_S)
 
+    def used_cameras(self) -> dict[str, Camera]:
+        """The cameras as the server uses them."""
+        return self.server.pipeline.cameras
+
     def true_camera(self, name: str) -> Camera:
         """A camera as it is by its faults."""
         return self.sources[name].true_camera

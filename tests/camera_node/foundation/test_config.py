@@ -84,6 +84,18 @@ def test_an_error_names_the_entry_of_a_mapping(tmp_path: Path):
         load_yaml(path, _Robots)
 
 
+class _Bodies(msgspec.Struct, forbid_unknown_fields=True):
+    bodies: tuple[Body, ...]
+
+
+def test_a_similar_name_is_proposed_in_an_entry_of_a_list(tmp_path: Path):
+    """As of a zone in arena.yaml."""
+    path = tmp_path / "bodies.yaml"
+    path.write_text("bodies: [{diameter_m: 0.1}, {diameter: 0.1}]")
+    with pytest.raises(ConfigError, match=r"bodies\[1\].*; did you mean `diameter_m`"):
+        load_yaml(path, _Bodies)
+
+
 class _Robots(msgspec.Struct):
     robots: dict[str, Body]
 

@@ -100,14 +100,32 @@ def test_a_clock_is_uncertain_while_a_judgement_takes_long(tmp_path: Path):
 
 @pytest.mark.ci
 def test_one_judgement_is_enough_for_what_it_does_not_change(tmp_path: Path):
-    """What keyframes show of a clock, if it does not grow after a judgement, makes none due."""
+    """What keyframes show of other errors, if it does not grow after a judgement, makes none due."""
     with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
         arena.wait(5.0)
         tracker = arena.tracker
         rig = tracker.monitors.rig
-        for judged, least_ns in ((0.0, CHECK_NS), (10.0, 2 * CHECK_NS)):
-            rig._pause_ns, rig._gain, rig._judged_gain = 2 * CHECK_NS, 11.0, judged
+        for judged, least_ns in ((0.0, CHECK_NS), (1.0, 2 * CHECK_NS)):
+            rig._pause_ns, rig._gain, rig._judged_gain = 2 * CHECK_NS, 1.1, judged
             assert rig._wait_ns == least_ns
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize(
+    "fault", [CameraFault(focal_scale=1.005), CameraFault(turn_rad=(0.0015, 0.0, 0.0))], ids=["focal", "turn"]
+)
+def test_errors_of_all_cameras_make_a_judgement_due(tmp_path: Path, fault: CameraFault):
+    """Each robot is where the cameras agree, so no frame set is doubtful: poses were wrong for six seconds, until the
+    next judgement was due."""
+    with VirtualArena(tmp_path, small_load(), judging_s=0.4) as arena:
+        arena.wait(5.0)
+        rig = arena.tracker.monitors.rig
+        rig._job, rig._checked_ns, rig._pause_ns = None, arena.clock.now_ns(), round(60e9)
+        arena.wait(1.0)
+        assert rig._gain < 1.0 < rig._wait_ns / CHECK_NS
+        for name in arena.cameras:
+            arena.place(name, fault)
+        assert _happens(arena, 2.0, lambda: rig._wait_ns == CHECK_NS)
 
 
 @pytest.mark.ci

@@ -54,7 +54,7 @@ def test_poses_are_within_their_claims_soon_after_a_start_with_a_camera_at_fault
         judge = arena.judge
         assert isinstance(judge, ClaimJudge)
         place(arena, fault.faults(0.0))
-        arena.wait(0.6)
+        arena.wait(0.8)  # a fit that noise does not explain is confirmed in five frame sets
         judge.begin()
         arena.wait(1.0)
     assert len(judge.rows) > 0.9 * judge.received

@@ -26,10 +26,10 @@ def test_the_used_cameras_see_what_own_cameras_see(seed: int):
     """No other camera sees a place that the zone's own cameras see; random places above the floor."""
     points = np.random.default_rng(seed).uniform([-2, -2, 0], [15, 2, 1.5], (2000, 3))
     used = CAMERAS.used(ZONES["middle"])
-    seen = points[CAMERAS.sees(ZONES["middle"], points)]
+    seen = points[CAMERAS.look_at(points).by(ZONES["middle"])]
     others = set(hall(6)) - used
     assert len(seen) > 100
-    assert not CAMERAS.sees(others, seen).any()
+    assert not CAMERAS.look_at(seen).by(others).any()
 
 
 def test_neighbours_adopt_the_cameras_of_a_dead_zone():
@@ -58,7 +58,7 @@ def test_expected_variances_are_those_of_simulated_views():
         """Centres and sizes in the images of the own cameras that see the point."""
         out = []
         for name in own:
-            if CAMERAS.sees({name}, p[None])[0]:
+            if CAMERAS.look_at(p[None]).by({name})[0]:
                 z = (np.linalg.inv(rig[name].matrix()) @ [*p, 1.0])[2]
                 out += [*rig[name].project_world(p[None])[0], 650.5 * diameter / z]
         return np.array(out)
@@ -67,6 +67,6 @@ def test_expected_variances_are_those_of_simulated_views():
     J = np.column_stack([(measure(point + d) - measure(point - d)) / (2 * step) for d in step * np.eye(3)])
     errors = np.linalg.pinv(J) @ rng.normal(0, sigma_px, (len(J), 4000))
     measured = (errors**2).sum(axis=0).mean() / sigma_px**2
-    expected = CAMERAS.variances(own, point[None])[0]
+    expected = CAMERAS.look_at(point[None]).variances(own)[0]
     assert measured == pytest.approx(expected, rel=0.1)  # 4000 samples of three squares: 4 standard errors
-    assert CAMERAS.variances(own, np.array([[16.0, 0, 0.2]]))[0] == np.inf
+    assert CAMERAS.look_at(np.array([[16.0, 0, 0.2]])).variances(own)[0] == np.inf
