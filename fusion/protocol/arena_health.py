@@ -112,6 +112,11 @@ def describe_contradiction(contradiction: Contradiction) -> str:
         return f"camera {names} contradicts the other cameras {size}: {cause}; calibrate it again"
     if contradiction.kind == "robot":
         return f"robot {names}: its markers are not where robots.yaml has them, {size}; measure it again"
+    if contradiction.kind == "names":
+        rounds = zip(contradiction.names, (*contradiction.names[1:], contradiction.names[0]), strict=True)
+        shown = ", ".join(f"{name} shows what {other} should" for name, other in rounds)
+        remedy = "they are not used until each node starts with its own name"
+        return f"cameras {names} have exchanged names: {shown}; {remedy}"
     if contradiction.kind == "wand":
         return f"the rig and all robots differ in size {size}; measure the wand and the markers, and calibrate again"
     cause = "which one is wrong is undecided, or the lenses or the wand's lengths are"

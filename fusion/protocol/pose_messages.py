@@ -356,17 +356,19 @@ class CameraHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Contradiction(msgspec.Struct, frozen=True, kw_only=True):
-    """Residuals of the last seconds that are larger than claimed.
+    """Residuals of the last seconds that are larger than claimed, or exchanged names of cameras.
 
     Attributes:
         kind: "camera": all fits without it; "robot": the others of its cameras fit; "undecided": no single camera
-            explains it, or several do; "wand": the whole rig has another size than the robots.
-        names: the camera, the robot, or the cameras that contradict each other.
-        error_over_claim: squared residuals over their expectation, of the robot that contradicts most.
-        size_mm: of the errors at the robots, RMS.
+            explains it, or several do; "wand": the whole rig has another size than the robots; "names": the names of
+            cameras are exchanged.
+        names: the camera, the robot, or the cameras that contradict each other; of exchanged names, each camera shows
+            what the next one should, and the last what the first should.
+        error_over_claim: squared residuals over their expectation, of the robot that contradicts most; 0 of names.
+        size_mm: of the errors at the robots, RMS; 0 of names.
     """
 
-    kind: Literal["camera", "robot", "undecided", "wand"]
+    kind: Literal["camera", "robot", "undecided", "wand", "names"]
     names: tuple[str, ...]
     error_over_claim: float
     size_mm: float

@@ -235,7 +235,7 @@ class TrackingPipeline:
         """Judge the cameras beside the thread that tracks; in it with None, so that a run repeats exactly."""
         self._judging = executor
         if self.tracker is not None:
-            self.tracker.monitors.rig.executor = executor
+            self.tracker.judge_cameras_in(executor)
 
     def associate_early(self) -> None:
         """Associate the frames of the open frame set while the last ones are missing: of eight frames, after six."""

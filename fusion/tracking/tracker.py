@@ -2,6 +2,7 @@
 """Tracks robots and unlabeled markers from frame set to frame set, live and offline. Reads no clock."""
 
 import logging
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,6 +25,7 @@ from fusion.tracking.acquisition import Acquired, Acquisition
 from fusion.tracking.association import AssociatedFrames, Association, OwnDetections
 from fusion.tracking.claim_check import ClaimCheck
 from fusion.tracking.estimator import AssignedFrames, Estimator, Prediction
+from fusion.tracking.exchanged_names import ExchangedNames
 from fusion.tracking.identification import RefinedFits
 from fusion.tracking.labelings import choose_labelings
 from fusion.tracking.motion_models import MotionModels
@@ -113,6 +115,7 @@ class Tracker:
         self.claims = ClaimCheck(self.estimator, self.table.markers, self.table.names)
         diameters = np.array([robot.diameter_m for robot in robots.values()])
         self.sizes = SizeCheck(self.table.names, diameters, self.cameras, self.table.markers)
+        self.names = ExchangedNames(self.cameras, diameters)
         self.acquires_none = False
         self._reasons: dict[int, str] = {}
         self._displaced: set[str] = set()  # robots whose markers are elsewhere, and were logged
@@ -185,6 +188,10 @@ class Tracker:
         """Judge the cameras by the robots after a frame set; exclude moved ones and apply recalibrated poses."""
         now = Snapshot(frame_set.t_ns, self.table.states, self.table.located)
         fit = FrameSetFit(self.robust.is_doubtful, self.own.displaced)
+        if self.names.check(frame_set):
+            for name in self.cameras.names:
+                self.monitors.rig.readmit(name)  # what was judged was judged by other images
+        frame_set = self.names.without(frame_set)
         corrections = self.monitors.check_extrinsics(frame_set, now, fit, self._recalibrates)
         if self.monitors.rig.is_settled and fit.is_doubtful:
             self.robust.settle()
@@ -209,6 +216,7 @@ class Tracker:
         other.acquires_none = self.acquires_none
         same = other.table.inherit(self.table, renamed)
         other.monitors.inherit(self.monitors, same)
+        other.names.inherit(self.names)
         other.motion.inherit(self.motion, same)
         other.rig_response.inherit(self.rig_response, same)
         other.table.claimed = other.rig_response.claimed(other.table.states, other.table.markers)
@@ -240,7 +248,16 @@ class Tracker:
             if contradiction.names[0] not in self._displaced:
                 log.warning(describe_contradiction(contradiction))
         self._displaced = {c.names[0] for c in displaced}
-        return (*(self.monitors.rig.contradictions() or self.claims.contradictions()), *displaced)
+        of_cameras = (
+            self.names.contradictions()  # which explain the others
+            or self.monitors.rig.contradictions()
+            or self.claims.contradictions()
+        )
+        return (*of_cameras, *displaced)
+
+    def judge_cameras_in(self, executor: Executor | None) -> None:
+        """Judge the cameras beside the thread that tracks; in it with None."""
+        self.monitors.rig.executor = self.names.executor = executor
 
     def not_acquired(self) -> dict[str, str]:
         """Why the robots that are neither tracked nor coasting were not acquired, by name."""
@@ -250,7 +267,7 @@ class Tracker:
 
     def _used(self, frame_set: FrameSet) -> FrameSet:
         is_known = not any(frame.time_sigma_s for frame in frame_set.frames)
-        return self.monitors.used(frame_set, 0.0 if is_known else self.table.speed_m_s)
+        return self.monitors.used(self.names.without(frame_set), 0.0 if is_known else self.table.speed_m_s)
 
     def _claim(self) -> None:
         """State the covariances of the robots with the errors of the cameras."""

@@ -61,6 +61,7 @@ REPORTS = (
     "its discs",
     "contradicts the other",
     "the rig is",
+    "exchanged names",
     UNDECIDED,
 )
 
@@ -412,7 +413,7 @@ def error_px(arena: VirtualArena | LiveArena, name: str) -> float:
 def judged(lines: Sequence[str], guilty: Collection[str]) -> str:
     """Who was reported: only cameras at fault, none, several that contradict each other, or an innocent one."""
     definite = [line for line in lines if UNDECIDED not in line]
-    named = [re.search(r"(?:the rig is refined.*: )?(?:camera|robot|the) (\w+)", line) for line in definite]
+    named = [re.search(r"(?:the rig is refined.*: )?(?:cameras?|robot|the) (\w+)", line) for line in definite]
     subjects = {found[1] for found in named if found}
     if subjects - set(guilty):
         return "wrong"
@@ -520,7 +521,7 @@ def row(several: list[Outcome]) -> list[str]:
     ratios = np.array([r for o in several for r in o.ratios])
     late = [o for o in several if any(r > LARGE for r in o.ratios[1:])]
     reports = [o.report for o in several]
-    rms = np.array([o.rms_mm for o in several])
+    rms = np.array([o.rms_mm for o in several if o.rms_mm > 0])  # of those with poses
     return [
         of.row,
         str(of.cameras),
@@ -530,8 +531,8 @@ def row(several: list[Outcome]) -> list[str]:
         f"{np.mean(ratios[np.isfinite(ratios)] < RIGHT):.0%}" if np.isfinite(ratios).any() else "-",
         str(len(late)),
         f"{np.nanmax(ratios, initial=0):.1f}",
-        f"{np.sqrt(np.nanmean(rms**2)):.2f}",
-        f"{np.nanmax(rms):.2f}",
+        f"{np.sqrt(np.mean(rms**2)):.2f}" if len(rms) else "-",
+        f"{np.max(rms):.2f}" if len(rms) else "-",
         f"{np.mean([o.tracked for o in several]):.0%}",
         f"{max(o.saved_px for o in several):.2f}",
     ]
