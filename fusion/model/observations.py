@@ -199,7 +199,8 @@ class CameraArray:
         self.focal = np.array([(camera.fx + camera.fy) / 2 for camera in cameras])
         self.height = np.array([camera.height for camera in cameras])
         self.area_px2 = np.array([camera.width * camera.height for camera in cameras], float)
-        of_size = self.size_error * errors_of_size(T)
+        self.errors_of_size = errors_of_size(T)
+        of_size = self.size_error * self.errors_of_size
         self.covariance = self.error_scale**2 * error_covariance(list(cameras)) + np.outer(of_size, of_size)
         self.error_px = np.minimum(image_errors(list(cameras), self.covariance), MAX_ERROR_PX)
 

@@ -169,9 +169,13 @@ class _Tracking:
     def __init__(self, arena: OfflineArena, faults: Counter[str]) -> None:
         self.tracker = Tracker(arena.cameras, arena.robots, arena.limits)
         self._faults = faults
+        self._judgements: RecordedJudgements | None = None  # those of a server
 
     def track(self, frame_set: FrameSet) -> TrackingResult | None:
         """The robots after a frame set; None if it has no solution, which is counted."""
+        if self._judgements is None and frame_set.judged is not None:
+            self._judgements = RecordedJudgements()
+            self.tracker.monitors.rig.doubt()  # as the server's is from the start
         try:
             return self.tracker.track(frame_set)
         except Exception:  # NumPy's and GTSAM's of a singular system, or a bug that some input shows
@@ -182,26 +186,28 @@ class _Tracking:
             self.tracker = self.tracker.restarted()
             return None
 
+    def check(self, frame_set: FrameSet) -> tuple[ExtrinsicsCorrection | RigRefinement, ...]:
+        """Judge the cameras when the server did."""
+        if self._judgements is not None and frame_set.judged is not None:
+            self.tracker.monitors.rig.executor = self._judgements
+            self._judgements.allow(frame_set.judged)
+        return self.tracker.check_extrinsics(frame_set)
+
 
 def _fuse(
     frame_sets: Iterable[FrameSet], tracking: _Tracking, arena: OfflineArena, summary: Summary
 ) -> Iterator[TrackingResult]:
     smoother = Smoother(tracking.tracker.table.names) if arena.smooth else None
-    judgements = RecordedJudgements()
     for frame_set in frame_sets:
         fused = tracking.track(frame_set)
         if fused is None:
             continue
-        tracker = tracking.tracker
         summary.add(fused)
         if smoother is None:
             yield fused
         else:
             yield from smoother.add(fused)
-        if frame_set.judged is not None:
-            tracker.monitors.rig.executor = judgements
-            judgements.allow(frame_set.judged)
-        for correction in tracker.check_extrinsics(frame_set):
+        for correction in tracking.check(frame_set):
             summary.add_correction(correction, frame_set.t_ns)
     summary.not_acquired = tracking.tracker.not_acquired()
     if not summary.frame_sets:

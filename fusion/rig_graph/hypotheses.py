@@ -372,7 +372,7 @@ def judge(window: Window, starts: Array, moved: Sequence[int] = ()) -> Verdict:
     Args:
         window: the keyframes.
         starts: (C, 8) errors that explain the images of each camera if only this one is at fault.
-        moved: cameras that are known to have moved: a fault is theirs.
+        moved: cameras that are known to have moved: a fault is theirs, and perhaps of one more.
     """
     n = len(window.names)
     none = fit(window, Hypothesis.of(None, (), n))
@@ -398,7 +398,9 @@ def _compare(
 ) -> Verdict:
     n, seeing = len(window.names), np.unique(window.camera).tolist()
     if moved:
-        return decide([*as_stated, fit(window, Hypothesis.of("pose", moved, n, starts))], seeing, moved)
+        more = [sorted({*moved, k}) for k in seeing if k not in moved]  # as the other one on its bar
+        poses = [fit(window, Hypothesis.of("pose", cameras, n, starts)) for cameras in (moved, *more)]
+        return decide([*as_stated, *poses], seeing, moved)
     fits = [fit(window, Hypothesis.of(cause, (k,), n, starts)) for cause in CAUSES for k in seeing]
     none = as_stated[0].hypothesis
     fits.append(fit(window, replace(none, cause="focal", cameras=tuple(seeing), common="focal")))

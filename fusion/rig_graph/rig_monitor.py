@@ -76,6 +76,9 @@ MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be
 FALL, AGREED_FALL = 0.5**0.125, 0.5
 REMEMBERED_NS = 4_000_000_000  # moments; a camera is judged within three seconds
 MAX_KNOWN = 4  # poses of a camera, to which it may return
+DOUBTED_NS = (
+    3_000_000_000  # of robots, after which a rig that was not judged is not doubted: no two cameras see them
+)
 
 
 class RigMonitor:
@@ -91,6 +94,7 @@ class RigMonitor:
         contradicting: names of the cameras of which some are at fault, but the data do not decide which.
         clock_doubts: by camera, the offset of its clock, s, that keyframes show, until judgements confirm or refute it.
         refines: whether poses, lenses and the places of markers are corrected by what robots show of them.
+        is_doubted: whether the rig may have changed since it was calibrated: nothing was judged yet, see `doubt`.
         is_settled: whether the last `check` judged what contradicts the predictions: no clock is searched for.
         executor: judges beside the thread that tracks; None judges in it, so that a run repeats exactly.
     """
@@ -122,7 +126,8 @@ class RigMonitor:
         self._claimed = 1.0  # the same, larger while nothing is decided
         self._doubted: set[str] = set()  # cameras that contradicted each other when claims grew
         self._held = False  # whether robots agreed with the rig in a window since the start
-        self.is_settled, self.refines = False, True
+        self.is_settled, self.refines, self.is_doubted = False, True, False
+        self._seen_ns: int | None = None  # when robots were first located
         self.executor: Executor | None = None
         self._known: dict[str, list[Pose]] = {}  # poses of each camera, that of the calibration first
         self.excluded: set[str] = set()
@@ -138,11 +143,17 @@ class RigMonitor:
         self._moved, self._held = old._moved, old._held
         self._scale, self._claimed, self._doubted = old._scale, old._claimed, old._doubted
         self._refinement = old._refinement
+        self.is_doubted, self._seen_ns = old.is_doubted, old._seen_ns
         self._cameras.count_errors(old._cameras.error_scale, old._cameras.size_error)
 
     def inherit_poses(self, old: "RigMonitor") -> None:
         """The poses that another monitor of the same cameras knows, and those that a user confirmed."""
         self._known, self.pinned, self.refines = old._known, old.pinned, old.refines
+
+    def doubt(self) -> None:
+        """Let claims count that the rig may have changed since it was calibrated, until robots are judged the first
+        time. One camera contradicts nothing."""
+        self.is_doubted = len(self._cameras.names) > 1
 
     def remember(self, rigs: Iterable[Mapping[str, Camera]]) -> None:
         """Poses of cameras in earlier rigs, oldest first, to which these cameras may return."""
@@ -228,6 +239,9 @@ class RigMonitor:
             recalibrates: False for the server of a zone that takes the rig from another.
         """
         self.is_settled = False
+        if self.is_doubted and now.tracked.any():
+            self._seen_ns = now.t_ns if self._seen_ns is None else self._seen_ns
+            self.is_doubted = now.t_ns < self._seen_ns + DOUBTED_NS
         if (excluded := self._exclude_displaced(fit.displaced)) is not None:
             return (excluded,)
         is_doubtful = fit.is_doubtful or bool(fit.displaced)
@@ -260,6 +274,7 @@ class RigMonitor:
                 self._note_watched(judged)
                 return ()
             self._pause_ns = round((now_ns - self._checked_ns) / USUAL_SHARE)
+            self.is_doubted &= judged is None
             if isinstance(judged, Unexplained):
                 self._note_unexplained(judged)
             elif judged is None:

@@ -180,6 +180,8 @@ class TrackingPipeline:
         """Restart tracking."""
         limits = self._config.limits
         self.tracker = Tracker(cameras, self.robots, limits, self._config.leads) if cameras else None
+        if self.tracker is not None:
+            self.tracker.monitors.rig.doubt()
         self.judge_cameras_in(self._judging)
         self.refine(self._refines)
         self.pause_acquisition(self._is_wand_recorded)

@@ -27,6 +27,10 @@ from fusion.tracking.estimator import Estimator
 from fusion.tracking.identification import RefinedFits
 from fusion.tracking.robust_update import RobustFit
 
+# Of a rig that may have changed since it was calibrated: each camera turned as if it was touched, by 0.3 degrees with a
+# focal length of 840 px, and the size as by a wand that was measured to 5 mm of 0.5 m.
+CHANGED_PX, CHANGED_SIZE = 5.0, 0.01
+
 
 class RigResponse:
     """The responses of N robots to errors of the cameras.
@@ -43,7 +47,7 @@ class RigResponse:
         self._cameras, n = estimator.cameras, len(estimator.single)
         self.responses = np.zeros((n, len(self._cameras.names), 12, ERRORS))
         self.counted = np.zeros((n, 12, 12))
-        self._factor, self._factor_of = np.zeros((0, 0)), (-1, 0.0)
+        self._factor, self._factor_of = np.zeros((0, 0)), (-1, 0.0, False)
 
     def inherit(self, old: "RigResponse", same: Mapping[int, int]) -> None:
         """Continue with the robots of another one, whose rows `same` has by row."""
@@ -103,7 +107,9 @@ class RigResponse:
             self.counted,
         )
 
-    def claimed(self, states: States, markers: MarkerTable, added_px2: float = 0.0) -> Array:
+    def claimed(
+        self, states: States, markers: MarkerTable, added_px2: float = 0.0, may_have_changed: bool = False
+    ) -> Array:
         """(N, 12, 12) covariances of the robots that contain the errors of the cameras, and of the places of markers on
         their robots.
 
@@ -111,17 +117,20 @@ class RigResponse:
             states: of the robots.
             markers: of the robots.
             added_px2: variance that the detections of a camera may have in common beside the calibration's error.
+            may_have_changed: whether the cameras may have turned, and the rig have another size.
         """
-        factor = self._factor_with(added_px2)
+        factor = self._factor_with(added_px2, may_have_changed)
         return _core.consider(states.P, self.counted, self.responses, factor, states.R, markers.frame)
 
-    def _factor_with(self, added_px2: float) -> Array:
+    def _factor_with(self, added_px2: float, may_have_changed: bool) -> Array:
         """(8 C, 8 C) lower triangular factor of the covariance of the cameras, each turned by `added_px2` besides."""
-        key = self._cameras.revision, added_px2
+        key = self._cameras.revision, added_px2, may_have_changed
         if key != self._factor_of:
             covariance = self._cameras.covariance.copy()
             turns = np.flatnonzero(np.arange(len(covariance)) % ERRORS < 2)
-            covariance[turns, turns] += added_px2 / self._cameras.focal[turns // ERRORS] ** 2
-            factor = covariance_factor(covariance)
+            px2 = added_px2 + CHANGED_PX**2 * may_have_changed
+            covariance[turns, turns] += px2 / self._cameras.focal[turns // ERRORS] ** 2
+            of_size = CHANGED_SIZE * may_have_changed * self._cameras.errors_of_size
+            factor = covariance_factor(covariance + np.outer(of_size, of_size))
             self._factor, self._factor_of = np.ascontiguousarray(factor), key
         return self._factor

@@ -230,6 +230,7 @@ class Tracker:
         other.acquires_none = self.acquires_none
         other.monitors.clocks.inherit(self.monitors.clocks)
         other.monitors.rig.inherit_poses(self.monitors.rig)
+        other.monitors.rig.is_doubted = self.monitors.rig.is_doubted
         return other
 
     def contradictions(self) -> tuple[Contradiction, ...]:
@@ -272,7 +273,8 @@ class Tracker:
     def _claim(self) -> None:
         """State the covariances of the robots with the errors of the cameras."""
         table = self.table
-        table.claimed = self.rig_response.claimed(table.states, table.markers, self.robust.added_px2)
+        doubts = self.robust.added_px2, self.monitors.rig.is_doubted
+        table.claimed = self.rig_response.claimed(table.states, table.markers, *doubts)
 
     def _misses_bodies(self, tracked: Mask) -> bool:
         """Whether a constellation is missing, whose acquisition can displace a single-marker robot."""

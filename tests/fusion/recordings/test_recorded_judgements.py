@@ -38,6 +38,7 @@ def test_a_replay_takes_judgements_when_the_server_took_them():
     poses, recorded = list[RobotPose](), list[FrameSet]()
     live, late = Tracker(before.cameras, ROBOTS), LateResults(DELAY, lambda: len(recorded))
     live.monitors.rig.executor = late
+    live.monitors.rig.doubt()
     for frame_set in given:
         poses += live.track(frame_set).poses
         late.release()

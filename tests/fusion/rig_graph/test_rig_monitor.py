@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from calib.rig.camera import Camera
 from camera_node.foundation.background_process import BackgroundProcess
 from camera_node.geometry.pose import Pose, rotation_from_vector
 from fusion.model.corrections import ExtrinsicsCorrection
@@ -24,7 +25,7 @@ from fusion.rig_graph.keyframes import Keyframe, Keyframes
 from fusion.rig_graph.robot_shapes import RobotShapes
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.tracker import Tracker
-from tests.benchmarks.trust import Case, run
+from tests.benchmarks.trust import WINDOW_S, Case, run
 from tests.fusion.clock_faults import ERROR_M, SIGMAS
 from tests.fusion.moved_camera import MOTIONS, MOVE_S, ROBOTS, black, moved
 from tests.fusion.rig_graph.fits import fitted
@@ -346,24 +347,25 @@ def test_no_other_camera_or_robot_is_reported(kind: str, cameras: int, reported:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "cameras", "robots", "speed_m_s", "seed"),
+    ("kind", "cameras", "robots", "speed_m_s", "seed", "found_s"),
     [
-        ("clock 2000 ppm", 3, 1, 0.5, 4),
-        ("drifting 0.3 deg in 10 s", 4, 4, 0.1, 2),
-        ("focal of all +0.5 %", 6, 1, 0.1, 3),
-        ("wand 1 % short", 8, 1, 0.0, 5),
+        ("clock 2000 ppm", 3, 1, 0.5, 4, 2),
+        ("drifting 0.3 deg in 10 s", 4, 4, 0.1, 2, 2),
+        ("focal of all +0.5 %", 6, 1, 0.1, 3, 4),
+        ("wand 1 % short", 8, 1, 0.0, 5, 2),
     ],
 )
 def test_what_robots_hardly_show_blames_no_innocent_camera(
-    kind: str, cameras: int, robots: int, speed_m_s: float, seed: int
+    kind: str, cameras: int, robots: int, speed_m_s: float, seed: int, found_s: int
 ):
     """A clock was taken for lenses, a refinement of 1.4 standard deviations named an innocent camera, and what all
-    lenses or the whole rig have in common was not found, or late: 7 and 25 mm, 80 and 380 times the claim."""
+    lenses or the whole rig have in common was not found: 7 and 25 mm, 80 and 380 times the claim. One slow robot shows
+    what all lenses have in common after three seconds."""
     case = Case(kind=kind, cameras=cameras, seed=seed, robots=robots, speed_m_s=speed_m_s)
     outcome = run(case)
     assert outcome.report == "right", outcome.lines
     assert outcome.rewritten == []
-    assert max(outcome.ratios[1:]) < 2.0
+    assert max(outcome.ratios[round(found_s / WINDOW_S) :]) < 2.0
 
 
 @pytest.mark.ci
@@ -408,6 +410,56 @@ def test_two_cameras_that_were_off_from_the_start_are_found(
     assert not any(ratio > 2.0 for ratio in outcome.ratios[1:])
 
 
+@pytest.mark.parametrize(
+    ("kind", "cameras", "seed", "robots"),
+    [
+        pytest.param("wand 1 % short", 4, 1, 1, marks=pytest.mark.ci),
+        pytest.param("focal +0.7 %", 4, 7, 4, marks=pytest.mark.slow),
+        pytest.param("marker 20 mm off", 6, 6, 4, marks=pytest.mark.slow),
+    ],
+)
+def test_until_robots_are_judged_claims_count_that_the_rig_may_have_changed(
+    kind: str, cameras: int, seed: int, robots: int
+):
+    """Robots agree with a rig of another size until sizes are compared: 24 mm off, 440 times the claim."""
+    outcome = run(
+        Case(kind=kind, cameras=cameras, seed=seed, robots=robots, at_start=kind.startswith("focal"))
+    )
+    assert outcome.report == "right", outcome.lines
+    assert max(outcome.ratios) < 2.0
+
+
+def test_a_rig_is_doubted_until_the_first_judgement():
+    """Or for three seconds, if no two cameras see a robot; one camera is not doubted."""
+    arena = Arena(ROBOTS, MOTIONS, sigma_px=0.1)
+    judged = doubted(arena.cameras)
+    follow(judged, arena.frames(40))
+    assert not judged.monitors.rig.is_doubted
+    plain = Tracker(arena.cameras, ROBOTS)
+    follow(plain, arena.frames(40))
+    np.testing.assert_array_equal(judged.table.claimed, plain.table.claimed)
+
+    def seen_alone(n: int) -> Tracker:
+        tracker = doubted(arena.cameras)
+        follow(tracker, [frame for frame in arena.frames(n) if frame.camera == "cam0" or n_set(frame) < 3])
+        return tracker
+
+    def n_set(frame: CalibratedFrame) -> int:
+        return round((frame.t_ns - START_NS) / PERIOD_NS)
+
+    before, after = seen_alone(60), seen_alone(110)
+    assert before.monitors.rig.is_doubted
+    assert not after.monitors.rig.is_doubted
+    assert not doubted({"cam0": arena.cameras["cam0"]}).monitors.rig.is_doubted
+
+
+def doubted(cameras: dict[str, Camera]) -> Tracker:
+    """A tracker as of a server."""
+    tracker = Tracker(cameras, ROBOTS)
+    tracker.monitors.rig.doubt()
+    return tracker
+
+
 @pytest.mark.ci
 def test_a_displaced_camera_is_not_excluded_while_cameras_contradict_each_other():
     """One robot at rest before three cameras: by then the one at fault predicted it. An innocent camera was excluded,
@@ -427,9 +479,12 @@ def test_a_camera_is_judged_though_every_second_frame_set_contradicts_the_predic
 
 
 @pytest.mark.ci
-def test_two_cameras_that_moved_together_are_excluded_together():
-    """Of a pair on one bar the first one was: poses by the second one were up to 130 mm off until it was judged."""
-    outcome = run(Case(kind="bar 0.5 deg", cameras=6, seed=4, robots=1))
+@pytest.mark.parametrize(("seed", "robots"), [(4, 1), (8, 4)])
+def test_two_cameras_that_moved_together_are_excluded_together(seed: int, robots: int):
+    """Of a pair on one bar the first one was: poses by the second one were up to 130 mm off until it was judged. Where
+    the first one is seen to show its markers elsewhere, it may be one of two: larger errors of all cameras were said to
+    explain the rest, so that it was used again, three times, and poses had 73 times their claim."""
+    outcome = run(Case(kind="bar 0.5 deg", cameras=6, seed=seed, robots=robots))
     assert outcome.report == "right", outcome.lines
     assert all("was moved" in line for line in outcome.lines[:2]), outcome.lines
     assert max(outcome.ratios[1:]) < 2.0
