@@ -9,7 +9,7 @@ it explains clearly more of each camera that it renames than other images in its
 """
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,7 +36,8 @@ CLEARLY, RATIO = 2, 1.5
 MAX_PERMUTED = 4  # suspected cameras of which all orders are tried; of more, exchanges of two
 MAX_SUSPECTED = 8  # of more, none is tried: the cameras see no common markers
 LOOK_NS = 500_000_000  # from one look to the next, while they show something else than what is known
-MAX_PAUSE_NS = 16_000_000_000  # each look that shows nothing else doubles the pause up to this
+# Each look that shows nothing else doubles the pause up to this, and up to that while somebody starts nodes again.
+MAX_PAUSE_NS, EXCHANGED_PAUSE_NS = 16_000_000_000, 2_000_000_000
 
 
 class ExchangedNames:
@@ -85,7 +86,7 @@ class ExchangedNames:
             return self.order != before
         self._due_ns = frame_set.t_ns + self._pause_ns
         scene = self._cameras.stated(self._cameras.error_scale), self._diameters
-        look = partial(find_order, frame_set, *scene)
+        look = partial(find_order, frame_set, *scene, frozenset(self.order))
         self._job = done(look) if self.executor is None else self.executor.submit(look)
         return self.order != before
 
@@ -100,7 +101,8 @@ class ExchangedNames:
 
     def _note(self, found: Order | None) -> None:
         is_known = found is None or found == self.order
-        self._pause_ns = min(2 * self._pause_ns, MAX_PAUSE_NS) if is_known else LOOK_NS
+        longest_ns = EXCHANGED_PAUSE_NS if self.order else MAX_PAUSE_NS
+        self._pause_ns = min(2 * self._pause_ns, longest_ns) if is_known else LOOK_NS
         if found is None:
             return
         self._n_agreed = self._n_agreed + 1 if found == self._last else 1
@@ -147,19 +149,23 @@ class _Explained:
         return sum(self.explained.values())
 
 
-def find_order(frame_set: FrameSet, cameras: CameraArray, diameters: Array) -> Order | None:
+def find_order(
+    frame_set: FrameSet, cameras: CameraArray, diameters: Array, exchanged: Collection[str] = ()
+) -> Order | None:
     """The names that are exchanged, by one frame set; empty if none are, None if that is not clear.
 
     Args:
         frame_set: the newest frame of each camera counts.
         cameras: cameras of the rig.
         diameters: (K,) of the discs, metres.
+        exchanged: cameras that were until now: each must show what it should, so that none are.
     """
     frames = {frame.camera: frame for frame in frame_set.frames}
     as_named = _explain(frame_set.t_ns, frames, cameras, diameters)
-    suspected = [n for n, seen in as_named.seen.items() if seen >= MIN_DETECTIONS and not as_named.is_most(n)]
+    showing = [name for name, seen in as_named.seen.items() if seen >= MIN_DETECTIONS]
+    suspected = [name for name in showing if not as_named.is_most(name)]
     if len(suspected) < 2:
-        return {}
+        return {} if set(exchanged) <= set(showing) - set(suspected) else None
     if len(suspected) > MAX_SUSPECTED:
         return None
     tried = [(Order(), as_named)]

@@ -18,7 +18,7 @@ from fusion.protocol.arena_health import describe_contradiction
 from fusion.server.frame_synchronizer import FrameSynchronizer
 from fusion.tracking.exchanged_names import Order, find_order
 from fusion.tracking.tracker import Tracker
-from tests.fusion.moved_camera import MOTIONS, ROBOTS
+from tests.fusion.moved_camera import MOTIONS, ROBOTS, black
 from tests.fusion.synthetic import PERIOD_NS, TRIANGLE, Arena, line, ring
 
 DIAMETERS = np.array([0.12])
@@ -124,12 +124,15 @@ def follow(tracker: Tracker, frames: Iterable[CalibratedFrame]) -> list[int]:
 
 
 def test_exchanged_cameras_are_reported_and_left_out_until_they_have_their_names(caplog):
-    """The four others track on, and none of them is blamed; other robots change nothing."""
+    """The four others track on, and none of them is blamed; other robots change nothing, nor do images in which the two
+    show nothing."""
     cameras = lenses(6)
-    frames = arena_of(cameras).frames(180)
-    half = len(frames) // 3
+    frames = arena_of(cameras).frames(300)
+    part = len(frames) // 5
     tracker = Tracker(cameras, ROBOTS)
-    follow(tracker, renamed(frames[:half], TWO, cameras))
+    follow(tracker, renamed(frames[:part], TWO, cameras))
+    assert [c.kind for c in tracker.contradictions()] == ["names"]
+    follow(tracker, [black(f) if f.camera in TWO else f for f in frames[part : 2 * part]])
     (found,) = tracker.contradictions()
     assert (found.kind, found.names) == ("names", ("cam0", "cam2"))
     assert describe_contradiction(found) in caplog.text
@@ -141,7 +144,7 @@ def test_exchanged_cameras_are_reported_and_left_out_until_they_have_their_names
     other = tracker.with_robots({"a": TRIANGLE}, {})
     assert other.contradictions() == (found,)
     with caplog.at_level(logging.INFO, "fusion"):
-        tracked = follow(tracker, frames[half:])
+        tracked = follow(tracker, frames[2 * part :])
     assert set(tracked[2:]) == {len(ROBOTS)}
     assert tracker.contradictions() == ()
     assert "no names are exchanged any more" in caplog.text
