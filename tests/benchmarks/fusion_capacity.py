@@ -121,7 +121,7 @@ class Queue:
         self._keys, self._statistics = Keys("load"), ServerStatistics()
         self._ingest = Ingest(self._keys, self._statistics)
         self.tracker = Tracker(load.rig, load.bodies)
-        self.tracker.monitors.rig.executor = BackgroundProcess()
+        self.tracker.judge_cameras_in(BackgroundProcess())
         rate_hz = rate_hz or load.hz
         self.synchronizer = FrameSynchronizer(round(1e9 / rate_hz))
         self.free_ns = self.busy_ns = self._first_ns = self._collected_ns = 0
