@@ -33,6 +33,11 @@ class RecordedJudgements(Executor):
             release()
 
 
+def start(job: Callable[[], T], executor: Executor | None) -> "Future[T]":
+    """Run a job beside the calling thread, or at once in it with None."""
+    return done(job) if executor is None else executor.submit(job)
+
+
 def done(job: Callable[[], T]) -> "Future[T]":
     """The result of a job that runs at once."""
     future: Future[T] = Future()

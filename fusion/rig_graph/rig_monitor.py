@@ -58,7 +58,7 @@ from fusion.rig_graph.judgements import (
     watch,
 )
 from fusion.rig_graph.keyframes import GATES_PX, Keyframes
-from fusion.rig_graph.recorded_judgements import done
+from fusion.rig_graph.recorded_judgements import start
 from fusion.rig_graph.refinement import Refinement
 from fusion.rig_graph.robot_shapes import RobotShapes
 
@@ -76,9 +76,7 @@ MAX_SIGMA_M = 0.004  # of its position: what the markers do not show must not be
 FALL, AGREED_FALL = 0.5**0.125, 0.5
 REMEMBERED_NS = 4_000_000_000  # moments; a camera is judged within three seconds
 MAX_KNOWN = 4  # poses of a camera, to which it may return
-DOUBTED_NS = (
-    3_000_000_000  # of robots, after which a rig that was not judged is not doubted: no two cameras see them
-)
+DOUBTED_NS = 3_000_000_000  # of robots in view, which no two cameras see: the rig is not doubted any more
 
 
 class RigMonitor:
@@ -335,7 +333,7 @@ class RigMonitor:
         return ExtrinsicsCorrection(name, None)
 
     def _start(self, job: Callable[[], Judgement | Unexplained | Watched | None]) -> None:
-        self._job = done(job) if self.executor is None else self.executor.submit(job)
+        self._job = start(job, self.executor)
 
     def _act(
         self, window: Window, verdict: Verdict, measured: Measured | None, recalibrates: bool

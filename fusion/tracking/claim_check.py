@@ -32,12 +32,12 @@ from fusion.protocol.arena_health import describe_contradiction
 from fusion.protocol.pose_messages import Contradiction
 from fusion.rig_graph.hypotheses import MIN_FOR_PAIRS
 from fusion.tracking.estimator import Estimator, Prediction
+from fusion.tracking.gating import POSE_DEGREES
 
 SAMPLE_EVERY, SAMPLE = 8, 4  # frame sets, and robots of one: a few milliseconds for any number of robots
 MEMORY = 40  # samples of a robot: 5 s at 60 Hz
 CLAIM_RATIO = 1.5  # of squared errors to claims: less does not change what a claim means
 FALSE_ALARM = 1e-6  # of one comparison: one in a month of ten comparisons a second
-POSE_DEGREES = 6
 MIN_REDUNDANCY = 1.0  # of a frame set: with less, everything fits
 # Of the squared errors of one sample to their claims, where it is compared: a robot of which a detection was another's
 # in two samples of those that are remembered contradicts nothing.

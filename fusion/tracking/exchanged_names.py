@@ -19,17 +19,17 @@ import numpy as np
 
 from camera_node.foundation.arrays import Array, Index
 from fusion.model.frames import CalibratedFrame, FrameSet
+from fusion.model.likeness import MIN_MARKERS
 from fusion.model.observations import CameraArray, DetectionTable
 from fusion.protocol.arena_health import describe_contradiction
 from fusion.protocol.pose_messages import Contradiction
 from fusion.rig_graph.hypotheses import CONFIRMED
-from fusion.rig_graph.recorded_judgements import done
+from fusion.rig_graph.recorded_judgements import start
 from fusion.tracking.marker_search import find_markers
 
 log = logging.getLogger("fusion")
 Order = dict[str, str]  # by the name under which images come, that of the camera in the rig that took them
 MIN_CAMERAS = 3  # that see a marker: the rays of two meet by many orders
-MIN_DETECTIONS = 3  # of a frame: markers of a constellation
 # Detections of a camera that the right order explains: as many more than by any images that are not its own, for which
 # chance explains some.
 CLEARLY, RATIO = 2, 1.5
@@ -76,18 +76,11 @@ class ExchangedNames:
         """Look at a frame set if it is time, with the frames of all cameras; whether other names are exchanged now."""
         before = self.order
         self._take_job()
-        seen = sum(frame.columns.shape[1] >= MIN_DETECTIONS for frame in frame_set.frames)
-        if (
-            self._job is not None
-            or frame_set.t_ns < self._due_ns
-            or seen < MIN_CAMERAS
-            or not len(self._diameters)
-        ):
-            return self.order != before
-        self._due_ns = frame_set.t_ns + self._pause_ns
-        scene = self._cameras.stated(self._cameras.error_scale), self._diameters
-        look = partial(find_order, frame_set, *scene, frozenset(self.order))
-        self._job = done(look) if self.executor is None else self.executor.submit(look)
+        is_due = self._job is None and frame_set.t_ns >= self._due_ns
+        if is_due and len(self._diameters) and _count_showing(frame_set) >= MIN_CAMERAS:
+            self._due_ns = frame_set.t_ns + self._pause_ns
+            scene = self._cameras.stated(self._cameras.error_scale), self._diameters
+            self._job = start(partial(find_order, frame_set, *scene, frozenset(self.order)), self.executor)
         return self.order != before
 
     def _take_job(self) -> None:
@@ -121,6 +114,10 @@ class ExchangedNames:
             Contradiction(kind="names", names=names, error_over_claim=0.0, size_mm=0.0)
             for names in _cycles(self.order)
         )
+
+
+def _count_showing(frame_set: FrameSet) -> int:
+    return sum(frame.columns.shape[1] >= MIN_MARKERS for frame in frame_set.frames)
 
 
 def _cycles(order: Mapping[str, str]) -> Iterator[tuple[str, ...]]:
@@ -162,7 +159,7 @@ def find_order(
     """
     frames = {frame.camera: frame for frame in frame_set.frames}
     as_named = _explain(frame_set.t_ns, frames, cameras, diameters)
-    showing = [name for name, seen in as_named.seen.items() if seen >= MIN_DETECTIONS]
+    showing = [name for name, seen in as_named.seen.items() if seen >= MIN_MARKERS]
     suspected = [name for name in showing if not as_named.is_most(name)]
     if len(suspected) < 2:
         return {} if set(exchanged) <= set(showing) - set(suspected) else None
@@ -176,12 +173,11 @@ def find_order(
     best, by_best = max(tried, key=lambda t: (t[1].total, -len(t[0])))
     rivals = [(order, by_order) for order, by_order in tried if len(order) <= len(best)]
 
-    def is_clear(name: str) -> bool:
-        source = {to: of for of, to in best.items()}[name]
-        others = (by.explained[name] for order, by in rivals if order.get(source, source) != name)
-        return by_best.explained[name] >= RATIO * max(others) + CLEARLY
+    def is_clear(name: str, of: str) -> bool:
+        others = (by.explained[of] for order, by in rivals if order.get(name, name) != of)
+        return by_best.explained[of] >= RATIO * max(others) + CLEARLY
 
-    return best if best and all(map(is_clear, best)) else None
+    return best if best and all(is_clear(name, of) for name, of in best.items()) else None
 
 
 def _orders(names: list[str]) -> Iterator[Order]:

@@ -7,6 +7,7 @@ MAX_CHI2 = (
 POSITION_GATE = 16.3  # chi-square with 3 degrees of freedom; rejects one true position in 1000
 MOTION_GATE = 22.5  # chi-square with 6 degrees of freedom; rejects one true motion in 1000 (7 m/s, 19 rad/s)
 DECISIVE_CHI2 = 9.0  # by which an alternative must be worse
+POSE_DEGREES = 6  # of freedom
 AXIS_SIGMA_PX = 0.25  # of a measured axis: blur and threshold change it by more than noise
 DIAMETER_TOLERANCE = 0.2  # relative, between the diameter that a view implies and that of a marker
 # Of prints of any size, m, where no robot tells the sizes in use: 4 to 60 cm, in steps that the tolerance covers.

@@ -42,14 +42,14 @@ from fusion.tracking.constellation_search import (
     TriangulatedMarkers,
     fit,
 )
-from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2, MOTION_GATE, POSITION_GATE
+from fusion.tracking.gating import DECISIVE_CHI2, MAX_CHI2, MOTION_GATE, POSE_DEGREES, POSITION_GATE
 
 POOR = 10.0  # times the usual squared residual, above which a fit is poor
 STRONG_DETECTIONS = 8  # of three markers: they overdetermine a pose by ten
 # Shares of the expected views that are detected. A true fit has 1 where nothing covers the robot, one with a wrong
 # marker up to 0.67, and a false one up to 0.5.
 MIN_EXPLAINED, EVIDENT = 0.6, 0.8
-POSE, CHANCE = 6, 1e-3  # parameters of a pose, and the probability of a chi-square that is not chance
+CHANCE = 1e-3  # probability of a chi-square that is not chance
 MAX_COMPARED = 1_000  # mappings in one frame set, all rivals of some robots; more wait for their turn
 MAX_RIVALS = (
     3_000  # mappings that compete with those of one robot; with more it waits until others are acquired
@@ -258,7 +258,7 @@ class _Decisions:
         is_whole &= level.refined.shared >= MIN_EXPLAINED
         explained = level.refined.explained
         many = is_whole | (mappings.points.shape[1] > MIN_MARKERS)
-        is_chance = level.refined.chi2 < chdtri(2 * n_detections - POSE, CHANCE)
+        is_chance = level.refined.chi2 < chdtri(2 * n_detections - POSE_DEGREES, CHANCE)
         return is_chance & np.where(np.isnan(explained), many, explained >= EVIDENT)
 
     def _has_all(self, mappings: Mappings) -> Mask:

@@ -219,7 +219,7 @@ class Tracker:
         other.names.inherit(self.names)
         other.motion.inherit(self.motion, same)
         other.rig_response.inherit(self.rig_response, same)
-        other.table.claimed = other.rig_response.claimed(other.table.states, other.table.markers)
+        other._claim()
         return other
 
     def restarted(self) -> "Tracker":
@@ -231,6 +231,7 @@ class Tracker:
         other.monitors.clocks.inherit(self.monitors.clocks)
         other.monitors.rig.inherit_poses(self.monitors.rig)
         other.monitors.rig.is_doubted = self.monitors.rig.is_doubted
+        other.names.inherit(self.names)
         return other
 
     def contradictions(self) -> tuple[Contradiction, ...]:

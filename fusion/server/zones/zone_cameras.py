@@ -116,12 +116,13 @@ class SeenPlaces:
 
     def by(self, cameras: Collection[str]) -> Mask:
         """(N,) the places that one of the cameras sees."""
-        return np.trace(self._sum(cameras), axis1=1, axis2=2) > 0
+        return _are_seen(self._sum(cameras))
 
     def variances(self, cameras: Collection[str]) -> Array:
         """(N,) expected variances of positions by the cameras that see them, m^2 for an error of 1 px; infinite where
         none does."""
-        information, seen = self._sum(cameras), self.by(cameras)
+        information = self._sum(cameras)
+        seen = _are_seen(information)
         variances = np.full(self.n, np.inf)
         variances[seen] = np.trace(np.linalg.inv(information[seen]), axis1=1, axis2=2)
         return variances
@@ -130,6 +131,11 @@ class SeenPlaces:
         """(N, 3, 3) of these cameras together."""
         of_these = [of_camera for name, of_camera in self.information.items() if name in cameras]
         return sum(of_these, np.zeros((self.n, 3, 3)))
+
+
+def _are_seen(information: Array) -> Mask:
+    """(N,) places of which there is information (N, 3, 3)."""
+    return np.trace(information, axis1=1, axis2=2) > 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

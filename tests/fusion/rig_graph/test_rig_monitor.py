@@ -449,6 +449,7 @@ def test_a_rig_is_doubted_until_the_first_judgement():
 
     before, after = seen_alone(60), seen_alone(110)
     assert before.monitors.rig.is_doubted
+    np.testing.assert_array_equal(before.with_robots(ROBOTS, {}).table.claimed, before.table.claimed)
     assert not after.monitors.rig.is_doubted
     assert not doubted({"cam0": arena.cameras["cam0"]}).monitors.rig.is_doubted
 
